@@ -1,0 +1,10 @@
+//! Edits surfaces stored as narrow-band level sets.
+
+#![warn(missing_docs)]
+
+pub mod error;
+pub mod grid;
+pub mod mesh;
+pub mod run;
+
+pub use error::{EditError, Result};

@@ -1,0 +1,36 @@
+//! Triangle meshes: files, and the way to a level set and back.
+
+use glam::DVec3;
+
+/// An indexed triangle mesh in world units.
+///
+/// `triangles` index `positions` counter-clockwise seen from outside. The attributes, where present, have one entry a
+/// vertex. Positions are f64: files may hold coordinates far from the origin, where f32 would lose the shape.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TriangleMesh {
+    /// Vertex positions.
+    pub positions: Vec<DVec3>,
+    /// Vertex indices of each triangle.
+    pub triangles: Vec<[u32; 3]>,
+    /// Linear RGBA in 0..1, one a vertex.
+    pub colors: Option<Vec<[f32; 4]>>,
+    /// Texture coordinates, one a vertex.
+    pub uvs: Option<Vec<[f32; 2]>>,
+}
+
+impl TriangleMesh {
+    /// The corners of triangle `t`.
+    pub fn corners(&self, t: usize) -> [DVec3; 3] {
+        self.triangles[t].map(|v| self.positions[v as usize])
+    }
+
+    /// Smallest box around the positions that triangles use; `None` without triangles.
+    pub fn bounding_box(&self) -> Option<(DVec3, DVec3)> {
+        self.triangles
+            .iter()
+            .flatten()
+            .map(|&v| self.positions[v as usize])
+            .map(|p| (p, p))
+            .reduce(|(lo, hi), (p, _)| (lo.min(p), hi.max(p)))
+    }
+}
