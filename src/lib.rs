@@ -6,7 +6,10 @@ pub mod error;
 pub mod grid;
 pub mod levelset;
 pub mod mesh;
+pub mod pde;
+pub mod region;
 pub mod run;
+pub mod stencil;
 
 pub use error::{EditError, Result};
 pub use levelset::LevelSet;

@@ -149,6 +149,11 @@ impl Grid {
         });
     }
 
+    /// Changes the masks of the leaves of `set`, in parallel.
+    pub fn update_masks(&mut self, set: &LeafSet, f: impl Fn(LeafId, &mut LeafMask) + Sync) {
+        self.masks.par_update(set, f);
+    }
+
     /// Changes the values and masks of all leaves, in parallel.
     pub fn update_all(&mut self, f: impl Fn(LeafId, &mut LeafValues, &mut LeafMask) + Sync) {
         let set = self.leaf_set().clone();
