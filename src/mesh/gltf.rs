@@ -308,3 +308,135 @@ fn decode(file: &File, accessor: &Accessor) -> Result<Vec<[f64; 5]>, String> {
     }
     Ok(values)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A buffer of three vertices in the plane z = 0, then a fourth, then 16-bit indices 0 1 2 3.
+    fn bytes() -> Vec<u8> {
+        let positions = [[0.0f32, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]];
+        let mut bytes: Vec<u8> = positions.as_flattened().iter().flat_map(|x| x.to_le_bytes()).collect();
+        bytes.extend([0u16, 1, 2, 3].iter().flat_map(|i| i.to_le_bytes()));
+        bytes
+    }
+
+    /// A document around [`bytes`]: `nodes` and `primitive` go in as JSON.
+    fn document(nodes: &str, primitive: &str, more: &str) -> String {
+        let uri = format!("data:application/octet-stream;base64,{}", BASE64.encode(bytes()));
+        format!(
+            r#"{{"asset": {{"version": "2.0"}}, "scene": 0, "scenes": [{{"nodes": [0]}}], "nodes": [{nodes}],
+            "buffers": [{{"byteLength": 56, "uri": "{uri}"}}],
+            "bufferViews": [{{"buffer": 0, "byteLength": 48}}, {{"buffer": 0, "byteOffset": 48, "byteLength": 8}}],
+            "accessors": [{{"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"}},
+                          {{"bufferView": 1, "componentType": 5123, "count": 4, "type": "SCALAR"}}],
+            "meshes": [{{"primitives": [{{"attributes": {{"POSITION": 0}} {primitive}}}]}}] {more}}}"#
+        )
+    }
+
+    fn parse(text: impl AsRef<[u8]>) -> Result<ReadMesh> {
+        super::read(Path::new("a.gltf"), text.as_ref())
+    }
+
+    const NODE: &str = r#"{"mesh": 0}"#;
+
+    /// Sum of the triangles' area vectors.
+    fn facing(mesh: &super::super::TriangleMesh) -> DVec3 {
+        let area = |t| {
+            let [a, b, c] = mesh.corners(t);
+            (b - a).cross(c - a) / 2.0
+        };
+        (0..mesh.triangles.len()).map(area).sum()
+    }
+
+    #[test]
+    fn strips_fans_and_skipped_modes() {
+        let strip = parse(document(NODE, r#", "mode": 5, "indices": 1"#, "")).unwrap().mesh;
+        assert_eq!(strip.triangles, [[0, 1, 2], [2, 1, 3]]);
+        assert_eq!(facing(&strip), DVec3::Z);
+        let fan = parse(document(NODE, r#", "mode": 6, "indices": 1"#, "")).unwrap().mesh;
+        assert_eq!(fan.triangles, [[0, 1, 2], [0, 2, 3]]);
+        let plain = parse(document(NODE, "", "")).unwrap();
+        assert_eq!(plain.mesh.triangles, [[0, 1, 2]]);
+        assert!(plain.warnings[0].contains("left-over indices"), "{:?}", plain.warnings);
+        let error = parse(document(NODE, r#", "mode": 1"#, "")).unwrap_err().to_string();
+        assert!(error.contains("no vertices and no faces") && error.contains("points or lines skipped"), "{error}");
+    }
+
+    #[test]
+    fn nested_transforms_are_multiplied_and_mirrors_turn_the_winding() {
+        let nodes = r#"{"translation": [10, 0, 0], "scale": [2, 2, 2], "children": [1]},
+                       {"matrix": [-1,0,0,0, 0,1,0,0, 0,0,1,0, 0,3,0,1], "mesh": 0}"#;
+        let mesh = parse(document(nodes, r#", "mode": 5"#, "")).unwrap().mesh;
+        assert_eq!(mesh.positions[1], DVec3::new(8.0, 6.0, 0.0));
+        assert_eq!(facing(&mesh), 4.0 * DVec3::Z, "the square still faces +z, its area times 4");
+        // A quarter turn about x takes +z to −y.
+        let nodes = r#"{"rotation": [0.70710678, 0, 0, 0.70710678], "mesh": 0}"#;
+        let mesh = parse(document(nodes, r#", "mode": 5"#, "")).unwrap().mesh;
+        assert!((facing(&mesh) + DVec3::Y).length() < 1e-12);
+    }
+
+    #[test]
+    fn quantized_positions_become_fractions() {
+        let text = document(NODE, "", r#", "extensionsRequired": ["KHR_mesh_quantization"]"#).replace(
+            r#""componentType": 5126, "count": 4"#,
+            r#""componentType": 5121, "normalized": true, "count": 4"#,
+        );
+        let mesh = parse(text).unwrap().mesh;
+        // The first bytes of 0.0, 0.0, 0.0, 1.0f32: the twelve that four vertices take.
+        assert_eq!(mesh.positions[..2], [DVec3::ZERO; 2]);
+    }
+
+    #[test]
+    fn data_beside_the_file_is_found() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = document(NODE, r#", "mode": 5"#, "");
+        let start = text.find("data:").unwrap();
+        let end = start + text[start..].find('"').unwrap();
+        let path = folder.path().join("a.gltf");
+        let outside = |uri: &str| format!("{}{uri}{}", &text[..start], &text[end..]);
+        std::fs::write(folder.path().join("my data.bin"), bytes()).unwrap();
+        let read = super::read(&path, outside("my%20data.bin").as_bytes()).unwrap();
+        assert_eq!(read.mesh.triangles.len(), 2);
+        std::fs::write(folder.path().join("my data.bin"), &bytes()[..40]).unwrap();
+        for (uri, part) in [
+            ("my%20data.bin", "buffer 0: truncated: 40 bytes of 56"),
+            ("none.bin", "buffer 0: `none.bin` cannot be read"),
+            ("https://example.org/a.bin", "only relative paths are followed"),
+            ("data:;base64,***", "base64"),
+            ("data:text/plain,x", "not base64"),
+        ] {
+            let error = super::read(&path, outside(uri).as_bytes()).unwrap_err().to_string();
+            assert!(error.contains(part), "{part} in {error}");
+        }
+    }
+
+    #[test]
+    fn refusals_name_what_is_wrong() {
+        let good = document(NODE, r#", "indices": 1"#, "");
+        let swap = |from: &str, to: &str| {
+            assert!(good.contains(from), "{from}");
+            good.replacen(from, to, 1)
+        };
+        let required = r#", "extensionsRequired": ["KHR_draco_mesh_compression"]"#;
+        for (text, part) in [
+            (document(NODE, "", required), "the required extension `KHR_draco_mesh_compression` is not supported"),
+            (document(r#"{"children": [1]}, {"children": [0]}"#, "", ""), "node 0 is reached twice"),
+            (document(r#"{"mesh": 7}"#, "", ""), "invalid glTF: nodes[0].mesh"),
+            (swap(r#""POSITION": 0"#, r#""NORMAL": 0"#), "POSITION"),
+            (
+                swap(r#""count": 4, "type": "VEC3""#, r#""count": 5, "type": "VEC3""#),
+                "accessor 0: 5 values reach beyond",
+            ),
+            (swap(r#""count": 4"#, r#""count": 18446744073709551615"#), "reach beyond"),
+            (swap(r#""byteOffset": 48"#, r#""byteOffset": 18446744073709551615"#), "reach beyond"),
+            (swap(r#""count": 4"#, r#""count": 3"#), "vertex index 3 is out of range: there are 3 vertices"),
+            (swap(r#""byteLength": 56"#, r#""byteLength": 57"#), "buffer 0: truncated: 56 bytes of 57"),
+            ("{".into(), "no glTF"),
+            ("glTF\u{2}\0\0\0\u{3}\0\0\0".into(), "truncated: the header claims 3 bytes, the file has 12"),
+        ] {
+            let error = parse(&text).unwrap_err().to_string();
+            assert!(error.starts_with("a.gltf: ") && error.contains(part), "{part} in {error}");
+        }
+    }
+}
