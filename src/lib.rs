@@ -2,6 +2,7 @@
 
 #![warn(missing_docs)]
 
+pub mod atomic;
 pub mod error;
 pub mod grid;
 pub mod levelset;

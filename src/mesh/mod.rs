@@ -1,5 +1,19 @@
 //! Triangle meshes: files, and the way to a level set and back.
 
+mod build;
+mod color;
+pub mod files;
+mod gltf;
+mod gltf_write;
+mod obj;
+mod off;
+mod ply;
+mod polygon;
+mod stl;
+mod text;
+
+pub use files::{MeshFormat, ReadMesh, read, write, write_to};
+
 use glam::DVec3;
 
 /// An indexed triangle mesh in world units.
