@@ -70,13 +70,13 @@ make_venv() {
 has_bpy || make_venv
 
 if [ -z "${VDB_EDIT:-}" ]; then
-    cargo build --locked
+    cargo build --locked || finish 0 1 0
     VDB_EDIT=$target/debug/vdb-edit
 fi
 mkdir -p "$work"
-"$VDB_EDIT" convert assets/spot.obj -o "$work/spot.vdb" --resolution 128
-"$VDB_EDIT" info "$work/spot.vdb" --json >"$work/info.json"
-expected=$("$venv/bin/python" tests/blender/expect.py "$work/info.json" assets/spot.obj)
+"$VDB_EDIT" convert assets/spot.obj -o "$work/spot.vdb" --resolution 128 || finish 0 1 0
+"$VDB_EDIT" info "$work/spot.vdb" --json >"$work/info.json" || finish 0 1 0
+expected=$("$venv/bin/python" tests/blender/expect.py "$work/info.json" assets/spot.obj) || finish 0 1 0
 mapfile -t expected <<<"$expected"
 
 status=0
