@@ -5,16 +5,25 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 out=${OUT:-out}
+# Voxels along the cow. The head ends up at three fifths of that length, so that both have voxels of the same size.
 resolution=${RESOLUTION:-256}
+head_resolution=$((resolution * 3 / 5))
 
 # Seconds with milliseconds, as an integer of milliseconds, without a process of its own.
 now_ms() { local t=${EPOCHREALTIME/[.,]/}; echo $((t / 1000)); }
 seconds() { printf '%d.%02d s' $(($1 / 1000)) $(($1 % 1000 / 10)); }
 
 step() {
-    local title=$1 start
+    local title=$1 start shown='' word
     shift
-    printf '\n%s\n  $ %s\n' "$title" "$*"
+    # As one would type it: an argument that has spaces needs its quotes.
+    for word in "$@"; do
+        case $word in
+            *' '*) shown+=" '$word'" ;;
+            *) shown+=" $word" ;;
+        esac
+    done
+    printf '\n%s\n  $%s\n' "$title" "$shown"
     start=$(now_ms)
     "$@"
     printf '  %s\n' "$(seconds $(($(now_ms) - start)))"
@@ -29,7 +38,7 @@ session=$(now_ms)
 step 'A cow becomes a level set' \
     vdb-edit convert assets/spot.obj -o "$out/spot.vdb" --resolution "$resolution"
 step "So does a goat's head" \
-    vdb-edit convert assets/goathead.obj -o "$out/goathead.vdb" --resolution "$resolution"
+    vdb-edit convert assets/goathead.obj -o "$out/goathead.vdb" --resolution "$head_resolution"
 # The goat looks along -x and its neck is open towards +x and -y; the cow looks along -z and its rump is at z = 0.9.
 step 'The head is scaled, turned and put onto the rump' \
     vdb-edit transform "$out/goathead.vdb" -o "$out/goathead-placed.vdb" \
@@ -38,7 +47,7 @@ step 'The two are united' \
     vdb-edit csg union "$out/spot.vdb" "$out/goathead-placed.vdb" -o "$out/union.vdb"
 # The seam lies within 0.29 of this centre.
 step 'The seam is smoothed, inside a sphere' \
-    vdb-edit smooth "$out/union.vdb" -o "$out/chimera.vdb" --method curvature --iterations 60 \
+    vdb-edit smooth "$out/union.vdb" -o "$out/chimera.vdb" --method curvature --iterations 200 \
     --region 'sphere center=0,0.12,0.775 radius=0.36'
 step 'The result becomes a mesh' \
     vdb-edit convert "$out/chimera.vdb" -o "$out/chimera.obj"
