@@ -22,13 +22,13 @@ const MAX_LINKS: usize = 40;
 /// as it was; every other failure is an [`EditError::Output`]. Devices and pipes cannot be renamed over: they are
 /// written to directly.
 pub fn write_atomically(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<()> {
-    let target = final_target(path)?;
-    if fs::metadata(&target).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
-        let device = File::options().write(true).open(&target).map_err(|e| failed(path, e))?;
+    // Asked of the path as given: links like /dev/stdout may lead to names that only the kernel can follow.
+    if fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+        let device = File::options().write(true).open(path).map_err(|e| failed(path, e))?;
         let mut buffered = BufWriter::new(device);
         return write(&mut buffered).and_then(|()| buffered.flush()).map_err(|e| failed(path, e));
     }
-    replace(path, &target, |file| {
+    replace(path, &final_target(path)?, |file| {
         let mut buffered = BufWriter::with_capacity(1 << 16, file.as_file_mut());
         write(&mut buffered).and_then(|()| buffered.flush()).map_err(|e| failed(path, e))
     })

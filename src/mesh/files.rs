@@ -115,6 +115,15 @@ pub fn write_to(out: &mut dyn Write, format: MeshFormat, mesh: &TriangleMesh) ->
     }
 }
 
+/// A file that another one names, relative to it. What is no regular file (a device never ends) is not followed.
+pub(super) fn read_beside(path: &Path, name: &str) -> io::Result<Vec<u8>> {
+    let beside = path.with_file_name(name);
+    if Path::new(name).is_absolute() || !std::fs::metadata(&beside)?.is_file() {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "not a file beside it"));
+    }
+    std::fs::read(beside)
+}
+
 /// The error of a mesh that a format cannot hold.
 pub(super) fn unwritable(problem: String) -> io::Error {
     io::Error::new(io::ErrorKind::InvalidInput, problem)
