@@ -126,8 +126,15 @@ fn load(path: &Path, data: &[u8]) -> Result<File> {
         let advice = "export without it (no compression, instances made real)";
         return Err(refuse(format!("the required extension `{name}` is not supported; {advice}")));
     }
+    // The crate's validation looks these accessors up before it has checked their indices.
+    let root = document.as_json();
+    let used = root.meshes.iter().flat_map(|m| &m.primitives).flat_map(|p| p.attributes.values());
+    if let Some(missing) = used.map(|index| index.value()).find(|&index| index >= root.accessors.len()) {
+        let problem = format!("accessor {missing} is missing: there are {}", root.accessors.len());
+        return Err(refuse(format!("invalid glTF: {problem}")));
+    }
     let mut invalid = None;
-    document.as_json().validate(document.as_json(), gltf::json::Path::new, &mut |at, error| {
+    root.validate(root, gltf::json::Path::new, &mut |at, error| {
         let at = at().to_string();
         // Harmless extensions were let through above; bounds of accessors are not needed.
         if !(at.starts_with("extensionsRequired") || at.ends_with(".min") || at.ends_with(".max")) {
@@ -428,6 +435,7 @@ mod tests {
             (document(r#"{"children": [1]}, {"children": [0]}"#, "", ""), "node 0 is reached twice"),
             (document(r#"{"mesh": 7}"#, "", ""), "invalid glTF: nodes[0].mesh"),
             (swap(r#""POSITION": 0"#, r#""NORMAL": 0"#), "POSITION"),
+            (swap(r#""POSITION": 0"#, r#""POSITION": 9"#), "invalid glTF: accessor 9 is missing: there are 2"),
             (
                 swap(r#""count": 4, "type": "VEC3""#, r#""count": 5, "type": "VEC3""#),
                 "accessor 0: 5 values reach beyond",
