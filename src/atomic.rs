@@ -199,8 +199,10 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn devices_are_written_to_and_a_full_one_is_an_output_error() {
+    fn devices_are_written_to_and_what_cannot_be_written_is_an_output_error() {
         write_atomically(Path::new("/dev/null"), |w| w.write_all(b"x")).unwrap();
+        let error = write_atomically(Path::new("/proc/not-here.ply"), |w| w.write_all(b"x")).unwrap_err();
+        assert_eq!(error.exit_code(), 4, "{error}");
         let error = write_atomically(Path::new("/dev/full"), |w| w.write_all(b"x")).unwrap_err();
         assert_eq!(error.exit_code(), 4, "{error}");
     }

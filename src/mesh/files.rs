@@ -76,7 +76,8 @@ impl fmt::Display for MeshFormat {
 ///
 /// Refused with [`EditError::Input`]: unknown extensions, unreadable, empty, malformed or truncated files, indices out of
 /// range, vertices that are not finite, files without faces. What can be read in one sensible way is, and said in
-/// [`ReadMesh::warnings`].
+/// [`ReadMesh::warnings`]. Vertices on texture seams occur once a side, as the attributes of a [`TriangleMesh`] need it: two
+/// vertices at the same place are the same point of the surface.
 pub fn read(path: &Path) -> Result<ReadMesh> {
     let format = MeshFormat::of(path).ok_or_else(|| EditError::input(path, unknown_extension()))?;
     let data = std::fs::read(path).map_err(|e| EditError::input(path, format!("cannot be read: {e}")))?;
