@@ -22,13 +22,13 @@ const MAX_LINKS: usize = 40;
 /// as it was; every other failure is an [`EditError::Output`]. Devices and pipes cannot be renamed over: they are
 /// written to directly.
 pub fn write_atomically(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<()> {
-    let target = final_target(path)?;
-    if fs::metadata(&target).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
-        let device = File::options().write(true).open(&target).map_err(|e| failed(path, e))?;
+    // Asked of the path as given: links like /dev/stdout may lead to names that only the kernel can follow.
+    if fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+        let device = File::options().write(true).open(path).map_err(|e| failed(path, e))?;
         let mut buffered = BufWriter::new(device);
         return write(&mut buffered).and_then(|()| buffered.flush()).map_err(|e| failed(path, e));
     }
-    replace(path, &target, |file| {
+    replace(path, &final_target(path)?, |file| {
         let mut buffered = BufWriter::with_capacity(1 << 16, file.as_file_mut());
         write(&mut buffered).and_then(|()| buffered.flush()).map_err(|e| failed(path, e))
     })
@@ -199,8 +199,10 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn devices_are_written_to_and_a_full_one_is_an_output_error() {
+    fn devices_are_written_to_and_what_cannot_be_written_is_an_output_error() {
         write_atomically(Path::new("/dev/null"), |w| w.write_all(b"x")).unwrap();
+        let error = write_atomically(Path::new("/proc/not-here.ply"), |w| w.write_all(b"x")).unwrap_err();
+        assert_eq!(error.exit_code(), 4, "{error}");
         let error = write_atomically(Path::new("/dev/full"), |w| w.write_all(b"x")).unwrap_err();
         assert_eq!(error.exit_code(), 4, "{error}");
     }

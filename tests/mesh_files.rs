@@ -196,7 +196,7 @@ fn real_meshes_survive_every_format() {
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), MeshFormat::ALL.len());
 }
 
-/// Damaged files are refused or read, and nothing else: every prefix step and a few thousand changed bytes a format.
+/// Damaged files are refused or read, and nothing else: cut off anywhere, or some bytes changed.
 #[test]
 fn damaged_files_neither_crash_nor_hang() {
     let Some(data) = data() else { return };
@@ -212,7 +212,7 @@ fn damaged_files_neither_crash_nor_hang() {
         let mut original = Vec::new();
         mesh::write_to(&mut original, format, &small).unwrap();
         let path = folder.path().join("damaged").with_extension(format.extension());
-        for round in 0..400 {
+        for round in 0..150 {
             let mut damaged = original.clone();
             match round % 2 {
                 0 => damaged.truncate(next(original.len())),
@@ -232,5 +232,5 @@ fn damaged_files_neither_crash_nor_hang() {
             }
         }
     }
-    assert!(refused > 600, "{refused}");
+    assert!(refused > 200, "{refused}");
 }

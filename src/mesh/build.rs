@@ -82,7 +82,7 @@ impl<'a> MeshBuilder<'a> {
         }
         let repeated = turn.len() < corners.len();
         if triangulate(&self.mesh.positions, turn, &mut self.mesh.triangles) == Outline::Crossed {
-            self.note("polygon(s) cross themselves or have no area", place);
+            self.note("polygon(s) cross themselves, have no area or are too intricate to tell", place);
         } else if repeated {
             self.note("polygon(s) run around the same corners several times, taken once", place);
         }

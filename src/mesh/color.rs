@@ -2,23 +2,28 @@
 //!
 //! PLY, OBJ and OFF do not say what their colours mean; like Blender, we take them as sRGB. glTF's are linear.
 
+/// A channel brought into 0..1; NaN becomes 0.
+pub(super) fn unit(channel: f32) -> f32 {
+    if channel.is_nan() { 0.0 } else { channel.clamp(0.0, 1.0) }
+}
+
 /// Encoded to linear; values outside 0..1 are clamped, NaN becomes 0.
 pub(super) fn to_linear(encoded: f32) -> f32 {
-    let c = f64::from(encoded.max(0.0).min(1.0));
+    let c = f64::from(unit(encoded));
     let linear = if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) };
     linear as f32
 }
 
 /// Linear to encoded; values outside 0..1 are clamped, NaN becomes 0.
 pub(super) fn to_srgb(linear: f32) -> f32 {
-    let c = f64::from(linear.max(0.0).min(1.0));
+    let c = f64::from(unit(linear));
     let encoded = if c <= 0.003_130_8 { c * 12.92 } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 };
     encoded as f32
 }
 
 /// A file's sRGB colour with linear alpha, each 0..1, as a mesh holds it.
 pub(super) fn decode([r, g, b, a]: [f32; 4]) -> [f32; 4] {
-    [to_linear(r), to_linear(g), to_linear(b), a.max(0.0).min(1.0)]
+    [to_linear(r), to_linear(g), to_linear(b), unit(a)]
 }
 
 /// A mesh's colour as the 8-bit sRGB that files hold, alpha linear.

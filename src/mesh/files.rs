@@ -76,7 +76,8 @@ impl fmt::Display for MeshFormat {
 ///
 /// Refused with [`EditError::Input`]: unknown extensions, unreadable, empty, malformed or truncated files, indices out of
 /// range, vertices that are not finite, files without faces. What can be read in one sensible way is, and said in
-/// [`ReadMesh::warnings`].
+/// [`ReadMesh::warnings`]. Vertices on texture seams occur once a side, as the attributes of a [`TriangleMesh`] need it: two
+/// vertices at the same place are the same point of the surface.
 pub fn read(path: &Path) -> Result<ReadMesh> {
     let format = MeshFormat::of(path).ok_or_else(|| EditError::input(path, unknown_extension()))?;
     let data = std::fs::read(path).map_err(|e| EditError::input(path, format!("cannot be read: {e}")))?;
@@ -113,6 +114,15 @@ pub fn write_to(out: &mut dyn Write, format: MeshFormat, mesh: &TriangleMesh) ->
         MeshFormat::Gltf => gltf_write::write_gltf(out, mesh),
         MeshFormat::Off => off::write(out, mesh),
     }
+}
+
+/// A file that another one names, relative to it. What is no regular file (a device never ends) is not followed.
+pub(super) fn read_beside(path: &Path, name: &str) -> io::Result<Vec<u8>> {
+    let beside = path.with_file_name(name);
+    if Path::new(name).is_absolute() || !std::fs::metadata(&beside)?.is_file() {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "not a file beside it"));
+    }
+    std::fs::read(beside)
 }
 
 /// The error of a mesh that a format cannot hold.

@@ -20,8 +20,9 @@ use gltf::mesh::Mode;
 use gltf::scene::Transform;
 use gltf::{Accessor, Document, Gltf, Primitive, Semantic};
 
-use super::ReadMesh;
 use super::build::MeshBuilder;
+use super::files::read_beside;
+use super::{ReadMesh, color};
 use crate::{EditError, Result};
 
 /// Required extensions that do not change where surfaces are.
@@ -69,7 +70,7 @@ pub(super) fn read(path: &Path, data: &[u8]) -> Result<ReadMesh> {
                 None => Ok(None),
             };
             colors.extend(added.clone(), values(Semantic::Colors(0))?, |c| {
-                [c[0], c[1], c[2], if c[4] > 3.0 { c[3] } else { 1.0 }].map(|c| c.max(0.0).min(1.0) as f32)
+                [c[0], c[1], c[2], if c[4] > 3.0 { c[3] } else { 1.0 }].map(|c| color::unit(c as f32))
             });
             uvs.extend(added.clone(), values(Semantic::TexCoords(0))?, |c| [c[0] as f32, 1.0 - c[1] as f32]);
         }
@@ -125,8 +126,15 @@ fn load(path: &Path, data: &[u8]) -> Result<File> {
         let advice = "export without it (no compression, instances made real)";
         return Err(refuse(format!("the required extension `{name}` is not supported; {advice}")));
     }
+    // The crate's validation looks these accessors up before it has checked their indices.
+    let root = document.as_json();
+    let used = root.meshes.iter().flat_map(|m| &m.primitives).flat_map(|p| p.attributes.values());
+    if let Some(missing) = used.map(|index| index.value()).find(|&index| index >= root.accessors.len()) {
+        let problem = format!("accessor {missing} is missing: there are {}", root.accessors.len());
+        return Err(refuse(format!("invalid glTF: {problem}")));
+    }
     let mut invalid = None;
-    document.as_json().validate(document.as_json(), gltf::json::Path::new, &mut |at, error| {
+    root.validate(root, gltf::json::Path::new, &mut |at, error| {
         let at = at().to_string();
         // Harmless extensions were let through above; bounds of accessors are not needed.
         if !(at.starts_with("extensionsRequired") || at.ends_with(".min") || at.ends_with(".max")) {
@@ -160,10 +168,10 @@ fn fetch(path: &Path, uri: &str) -> Result<Vec<u8>, String> {
         return BASE64.decode(text).map_err(|e| format!("base64: {e}"));
     }
     let name = percent_encoding::percent_decode_str(uri).decode_utf8().map_err(|e| e.to_string())?;
-    if name.contains("://") || Path::new(&*name).is_absolute() {
+    if name.contains("://") {
         return Err(format!("`{name}` is not beside the file; only relative paths are followed"));
     }
-    std::fs::read(path.with_file_name(&*name)).map_err(|e| format!("`{name}` cannot be read: {e}"))
+    read_beside(path, &name).map_err(|e| format!("`{name}` cannot be read: {e}"))
 }
 
 /// The nodes of the default scene with their transforms to world.
@@ -243,6 +251,7 @@ fn read_primitive(
     if primitive.mode() == Mode::Triangles && indices.len() % 3 != 0 {
         builder.note("primitive(s) with left-over indices", || place.into());
     }
+    let mut polygon = Vec::with_capacity(3);
     let mirrored = to_world.determinant() < 0.0;
     for t in 0..triangles {
         // Chapter 3.7.2.1: every second triangle of a strip is turned.
@@ -253,8 +262,9 @@ fn read_primitive(
             _ => [3 * t, 3 * t + 1, 3 * t + 2],
         }
         .map(corner);
-        let turned = if mirrored { [a, c, b] } else { [a, b, c] };
-        builder.polygon(&mut turned.to_vec(), || format!("{place} triangle {t}"));
+        polygon.clear();
+        polygon.extend(if mirrored { [a, c, b] } else { [a, b, c] });
+        builder.polygon(&mut polygon, || format!("{place} triangle {t}"));
     }
     Ok(())
 }
@@ -402,6 +412,7 @@ mod tests {
         for (uri, part) in [
             ("my%20data.bin", "buffer 0: truncated: 40 bytes of 56"),
             ("none.bin", "buffer 0: `none.bin` cannot be read"),
+            ("/dev/zero", "`/dev/zero` cannot be read: not a file beside it"),
             ("https://example.org/a.bin", "only relative paths are followed"),
             ("data:;base64,***", "base64"),
             ("data:text/plain,x", "not base64"),
@@ -424,6 +435,7 @@ mod tests {
             (document(r#"{"children": [1]}, {"children": [0]}"#, "", ""), "node 0 is reached twice"),
             (document(r#"{"mesh": 7}"#, "", ""), "invalid glTF: nodes[0].mesh"),
             (swap(r#""POSITION": 0"#, r#""NORMAL": 0"#), "POSITION"),
+            (swap(r#""POSITION": 0"#, r#""POSITION": 9"#), "invalid glTF: accessor 9 is missing: there are 2"),
             (
                 swap(r#""count": 4, "type": "VEC3""#, r#""count": 5, "type": "VEC3""#),
                 "accessor 0: 5 values reach beyond",

@@ -12,6 +12,7 @@ use gltf::Semantic;
 use gltf::json::validation::{Checked::Valid, USize64};
 use gltf::json::{self, Index, accessor, buffer};
 use gltf::mesh::Mode;
+use rustc_hash::FxHashMap;
 
 use super::TriangleMesh;
 use super::files::unwritable;
@@ -154,14 +155,61 @@ fn singles(mesh: &TriangleMesh) -> io::Result<Vec<Vec3>> {
     }
 }
 
-/// Smooth normals: those of the triangles around a vertex, weighted by area. Where they cancel, any unit vector: the
-/// format allows no other length.
+/// Smooth normals: those of the triangles around a place, weighted by area, so that vertices split at a seam shade alike.
+/// Where they cancel, any unit vector: the format allows no other length.
 fn normals(mesh: &TriangleMesh) -> Vec<Vec3> {
+    let mut at_place: FxHashMap<[u64; 3], usize> = FxHashMap::default();
+    let place: Vec<usize> = (0..mesh.positions.len())
+        .map(|v| *at_place.entry(mesh.positions[v].to_array().map(f64::to_bits)).or_insert(v))
+        .collect();
     let mut sums = vec![DVec3::ZERO; mesh.positions.len()];
     for (t, triangle) in mesh.triangles.iter().enumerate() {
         let [a, b, c] = mesh.corners(t);
         let area = (b - a).cross(c - a);
-        triangle.iter().for_each(|&v| sums[v as usize] += area);
+        triangle.iter().for_each(|&v| sums[place[v as usize]] += area);
     }
-    sums.into_iter().map(|sum| sum.try_normalize().unwrap_or(DVec3::Z).as_vec3()).collect()
+    place.into_iter().map(|v| sums[v].try_normalize().unwrap_or(DVec3::Z).as_vec3()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn split_vertices_share_a_normal_and_lone_ones_have_one() {
+        // A roof whose ridge x = 0 is split, its right side twice as long, and a vertex without triangles.
+        let mesh = TriangleMesh {
+            positions: [[0, 0, 1], [0, 1, 1], [-1, 0, 0], [0, 0, 1], [2, 0, -1], [0, 1, 1], [9, 9, 9]]
+                .map(|p| DVec3::from_array(p.map(f64::from)))
+                .to_vec(),
+            triangles: vec![[0, 1, 2], [3, 4, 5]],
+            ..Default::default()
+        };
+        let normals = normals(&mesh);
+        // The area vectors are (-1, 0, 1) and (2, 0, 2).
+        let ridge = Vec3::new(1.0, 0.0, 3.0).normalize();
+        for v in [0, 1, 3, 5] {
+            assert!((normals[v] - ridge).length() < 1e-6, "{}", normals[v]);
+        }
+        assert!((normals[2] - Vec3::new(-1.0, 0.0, 1.0).normalize()).length() < 1e-6);
+        assert_eq!(normals[6], Vec3::Z);
+    }
+
+    #[test]
+    fn the_document_is_valid_and_bounds_its_positions() {
+        let mesh = TriangleMesh {
+            positions: vec![DVec3::X, DVec3::Y * 2.0, -DVec3::Z],
+            triangles: vec![[0, 1, 2]],
+            colors: Some(vec![[0.5; 4]; 3]),
+            uvs: Some(vec![[0.5; 2]; 3]),
+        };
+        let mut glb = Vec::new();
+        write_glb(&mut glb, &mesh).unwrap();
+        // The crate's own strict validation.
+        let document = gltf::Gltf::from_slice(&glb).unwrap();
+        let primitive = document.meshes().next().and_then(|mesh| mesh.primitives().next()).unwrap();
+        let bounds = primitive.bounding_box();
+        assert_eq!((bounds.min, bounds.max), ([0.0, 0.0, -1.0], [1.0, 2.0, 0.0]));
+        assert_eq!(primitive.attributes().count(), 4);
+    }
 }

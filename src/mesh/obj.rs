@@ -17,20 +17,21 @@ use glam::DVec3;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::build::MeshBuilder;
+use super::files::read_beside;
 use super::text::{lines, number, show, words};
 use super::{ReadMesh, TriangleMesh, color};
 use crate::Result;
 
-/// A corner without texture coordinate.
-const NO_UV: u32 = u32::MAX;
+/// In place of an index that a corner does not give.
+const NONE: u32 = u32::MAX;
 
 /// What the statements of the file add up to, before indices are checked: faces may come before their vertices.
 #[derive(Default)]
 struct Statements {
     colors: Vec<Option<[f32; 3]>>,
     uvs: Vec<[f32; 2]>,
-    /// Position and texture coordinate of all corners, from 0.
-    corners: Vec<(u64, Option<u64>)>,
+    /// Position and texture coordinate (or [`NONE`]) of all corners, from 0.
+    corners: Vec<(u32, u32)>,
     /// The end of each face in `corners`, and its line.
     faces: Vec<(usize, usize)>,
     materials: FxHashSet<Vec<u8>>,
@@ -79,7 +80,7 @@ impl Statements {
             b"f" | b"fo" => self.face(builder, words, line)?,
             b"mtllib" => {
                 let name = String::from_utf8_lossy(rest(text, keyword)).into_owned();
-                match std::fs::read(path.with_file_name(&name)) {
+                match read_beside(path, &name) {
                     Ok(library) => self.materials.extend(material_names(&library)),
                     Err(_) => builder.warn(format!("line {line}: material library `{name}` is missing; not needed")),
                 }
@@ -127,25 +128,13 @@ impl Statements {
         let first = self.corners.len();
         for word in words {
             let mut parts = word.split(|&b| b == b'/');
-            let mut index = |count: usize| match parts.next() {
-                None | Some([]) => Ok(None),
-                Some(part) => match number::<i64>(part)? {
-                    0 => Err("indices begin at 1, or at -1 for the latest".into()),
-                    index @ 1.. => Ok(Some(index as u64 - 1)),
-                    index => match (count as u64).checked_sub(index.unsigned_abs()) {
-                        Some(index) => Ok(Some(index)),
-                        None => Err(format!("{index} is out of range: there are {count} so far")),
-                    },
-                },
-            };
-            let corner = index(builder.mesh.positions.len()).and_then(|v| Ok((v, index(self.uvs.len())?)));
-            match corner {
-                Ok((Some(v), vt)) => self.corners.push((v, vt)),
-                Ok((None, _)) => {
-                    return Err(builder.refuse(format!("line {line}: face corner `{}` has no vertex", show(word))));
-                }
-                Err(e) => return Err(builder.refuse(format!("line {line}: face corner `{}`: {e}", show(word)))),
-            }
+            let mut next = |count| parts.next().map_or(Ok(NONE), |part| from_zero(part, count));
+            let corner = next(builder.mesh.positions.len()).and_then(|v| match v {
+                NONE => Err("no vertex".into()),
+                v => Ok((v, next(self.uvs.len())?)),
+            });
+            let bad = |e| builder.refuse(format!("line {line}: face corner `{}`: {e}", show(word)));
+            self.corners.push(corner.map_err(bad)?);
         }
         if self.corners.len() - first < 3 {
             self.corners.truncate(first);
@@ -160,7 +149,7 @@ impl Statements {
     fn finish(self, mut builder: MeshBuilder) -> Result<ReadMesh> {
         let in_file = builder.mesh.positions.len();
         // Texture coordinate of each vertex so far, and the copies of vertices on seams.
-        let mut uv_of = vec![NO_UV; in_file];
+        let mut uv_of = vec![NONE; in_file];
         let mut copies: FxHashMap<(u32, u32), u32> = FxHashMap::default();
         let mut origin: Vec<u32> = Vec::new();
         let mut polygon = Vec::new();
@@ -169,24 +158,22 @@ impl Statements {
             polygon.clear();
             for &(v, vt) in &self.corners[start..end] {
                 // Said in the file's own counting, from 1.
-                let bad = |what: &str, i: u64, count: usize| {
-                    let problem = format!("{what} index {} is out of range: there are {count} (1..={count})", i + 1);
+                let bad = |what: &str, index: u32, count: usize| {
+                    let index = u64::from(index) + 1;
+                    let problem = format!("{what} index {index} is out of range: there are {count} (1..={count})");
                     builder.refuse(format!("line {line}: {problem}"))
                 };
-                let v = u32::try_from(v).ok().filter(|&v| (v as usize) < in_file).ok_or(v);
-                let v = v.map_err(|v| bad("vertex", v, in_file))?;
-                let vt = match vt {
-                    None => NO_UV,
-                    Some(vt) => match u32::try_from(vt) {
-                        Ok(valid) if (valid as usize) < self.uvs.len() => valid,
-                        _ => return Err(bad("texture coordinate", vt, self.uvs.len())),
-                    },
-                };
+                if v as usize >= in_file {
+                    return Err(bad("vertex", v, in_file));
+                }
+                if vt != NONE && vt as usize >= self.uvs.len() {
+                    return Err(bad("texture coordinate", vt, self.uvs.len()));
+                }
                 let known = &mut uv_of[v as usize];
-                if *known == NO_UV {
+                if *known == NONE {
                     *known = vt;
                 }
-                let same = vt == NO_UV || *known == vt || self.uvs[*known as usize] == self.uvs[vt as usize];
+                let same = vt == NONE || *known == vt || self.uvs[*known as usize] == self.uvs[vt as usize];
                 polygon.push(match same {
                     true => v,
                     false => *copies.entry((v, vt)).or_insert_with(|| {
@@ -203,7 +190,7 @@ impl Statements {
         if u32::try_from(builder.mesh.positions.len()).is_err() {
             return Err(builder.refuse("more than 4,294,967,295 vertices once split at texture seams"));
         }
-        if uv_of.iter().any(|&vt| vt != NO_UV) {
+        if uv_of.iter().any(|&vt| vt != NONE) {
             builder.mesh.uvs =
                 Some(uv_of.iter().map(|&vt| self.uvs.get(vt as usize).copied().unwrap_or_default()).collect());
         }
@@ -223,6 +210,21 @@ impl Statements {
         }
         builder.finish()
     }
+}
+
+/// An index of the file, from 1 or backwards from −1, as one from 0; [`NONE`] where nothing stands.
+fn from_zero(part: &[u8], count: usize) -> Result<u32, String> {
+    if part.is_empty() {
+        return Ok(NONE);
+    }
+    let index: i64 = number(part)?;
+    let from_zero = match index {
+        0 => return Err("indices begin at 1, or at -1 for the latest".into()),
+        1.. => Some(index as u64 - 1),
+        ..0 => (count as u64).checked_sub(index.unsigned_abs()),
+    };
+    let valid = from_zero.and_then(|index| u32::try_from(index).ok()).filter(|&index| index != NONE);
+    valid.ok_or_else(|| format!("{index} is out of range: there are {count} so far"))
 }
 
 fn numbers<'a>(words: impl Iterator<Item = &'a [u8]>) -> Result<Vec<f64>, String> {
@@ -336,8 +338,9 @@ mod tests {
             ("f 0 1 2", "line 5: face corner `0`: indices begin at 1"),
             ("f -5 1 2", "line 5: face corner `-5`: -5 is out of range: there are 4 so far"),
             ("f 1 2 99999999999999999999", "line 5: face corner"),
+            ("f 1 2 4294967296", "4294967296 is out of range"),
             ("f 1/1 2/1 3/1", "texture coordinate index 1 is out of range: there are 0"),
-            ("f /1 2 3", "has no vertex"),
+            ("f /1 2 3", "face corner `/1`: no vertex"),
             ("f 1 b 3", "`b` is not a number"),
             ("v 1 2", "line 5: a vertex needs 3 coordinates, it has 2"),
             ("v 1 3.1+e2 0", "line 5: `3.1+e2` is not a number"),

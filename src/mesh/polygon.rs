@@ -19,7 +19,7 @@ const AREA_TOLERANCE: f64 = 1e-6;
 pub(super) enum Outline {
     /// The triangles cover the polygon exactly once.
     Simple,
-    /// The polygon crosses itself or has no area: its triangles may overlap.
+    /// The polygon crosses itself, has no area, or is too intricate to tell: its triangles may overlap.
     Crossed,
 }
 

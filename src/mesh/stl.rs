@@ -88,11 +88,12 @@ fn read_binary(welder: &mut Welder, data: &[u8]) -> Result<()> {
     if used < body.len() {
         welder.builder.warn(format!("{} bytes behind the last triangle are ignored", body.len() - used));
     }
+    let mut corners = Vec::with_capacity(3);
     for (t, facet) in body[..used].chunks_exact(FACET).enumerate() {
         let place = || format!("triangle {t} (byte {})", HEADER + t * FACET);
         let (numbers, _) = facet.as_chunks::<4>();
         let value = |i: usize| f64::from(f32::from_le_bytes(numbers[i]));
-        let mut corners = Vec::with_capacity(3);
+        corners.clear();
         for i in [3, 6, 9] {
             corners.push(welder.vertex(DVec3::new(value(i), value(i + 1), value(i + 2)), place)?);
         }
