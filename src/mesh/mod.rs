@@ -1,5 +1,20 @@
 //! Triangle meshes: files, and the way to a level set and back.
 
+mod bvh;
+mod closest;
+mod findings;
+mod prepare;
+#[cfg(test)]
+mod testing;
+mod topology;
+mod winding;
+
+pub use bvh::{Bvh, Hit};
+pub use findings::MeshFindings;
+pub use prepare::{prepare, weld_equal};
+pub use topology::{Topology, analyze};
+pub use winding::WindingNumber;
+
 use glam::DVec3;
 
 /// An indexed triangle mesh in world units.
