@@ -20,12 +20,39 @@ use super::bvh::{Bvh, Children};
 /// Signed solid angle of a triangle seen from `p`, positive when `p` is on the inner side (van Oosterom and Strackee 1983).
 /// In the triangle's plane it is 0.
 pub(crate) fn solid_angle(p: DVec3, corners: [DVec3; 3]) -> f64 {
+    let (re, im) = half_angle(p, corners);
+    2.0 * im.atan2(re)
+}
+
+/// A complex number whose argument is half the solid angle.
+#[inline]
+fn half_angle(p: DVec3, corners: [DVec3; 3]) -> (f64, f64) {
     let [a, b, c] = corners.map(|corner| corner - p);
     let (la, lb, lc) = (a.length(), b.length(), c.length());
     let numerator = a.dot(b.cross(c));
     let denominator = la * lb * lc + a.dot(b) * lc + b.dot(c) * la + c.dot(a) * lb;
     // In the plane the sign of a zero would choose between 2π and −2π.
-    if numerator == 0.0 { 0.0 } else { 2.0 * numerator.atan2(denominator) }
+    if numerator == 0.0 { (1.0, 0.0) } else { (denominator, numerator) }
+}
+
+/// Sum of the solid angles of a few triangles. Arguments add up where complex numbers multiply: one arctangent serves
+/// several triangles, as long as all factors and products stay in the right half-plane, where nothing wraps around.
+fn sum_of_solid_angles(p: DVec3, triangles: &[[DVec3; 3]]) -> f64 {
+    let mut sum = 0.0;
+    let (mut re, mut im) = (1.0, 0.0);
+    for &triangle in triangles {
+        let (x, y) = half_angle(p, triangle);
+        let product = (re * x - im * y, re * y + im * x);
+        if x <= 0.0 {
+            sum += f64::atan2(y, x);
+        } else if product.0 > 0.0 {
+            (re, im) = product;
+        } else {
+            sum += f64::atan2(im, re);
+            (re, im) = (x, y);
+        }
+    }
+    2.0 * (sum + im.atan2(re))
 }
 
 /// How many radii away a group of triangles must be to be seen as a whole: the value of Barill et al. The test below
@@ -168,7 +195,7 @@ impl<'a> WindingNumber<'a> {
             }
             match self.bvh.children(node) {
                 Children::Nodes(pair) => stack.extend(pair),
-                Children::Triangles(list) => sum += list.iter().map(|&t| solid_angle(p, t)).sum::<f64>(),
+                Children::Triangles(list) => sum += sum_of_solid_angles(p, list),
             }
         }
         sum / (4.0 * PI)
