@@ -4,6 +4,7 @@ mod bvh;
 mod closest;
 mod findings;
 mod prepare;
+mod scatter;
 #[cfg(test)]
 mod testing;
 mod topology;
@@ -12,6 +13,7 @@ mod winding;
 pub use bvh::{Bvh, Hit};
 pub use findings::MeshFindings;
 pub use prepare::{prepare, weld_equal};
+pub use scatter::{UnsignedLeaf, distance_to_triangles};
 pub use topology::{Topology, analyze};
 pub use winding::WindingNumber;
 
