@@ -4,7 +4,9 @@
 
 pub mod error;
 pub mod grid;
+pub mod levelset;
 pub mod mesh;
 pub mod run;
 
 pub use error::{EditError, Result};
+pub use levelset::LevelSet;
