@@ -2,7 +2,9 @@
 
 mod bvh;
 mod closest;
+mod crossings;
 mod findings;
+mod pieces;
 mod prepare;
 mod scatter;
 #[cfg(test)]
