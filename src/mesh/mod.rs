@@ -2,13 +2,16 @@
 
 mod bvh;
 mod closest;
+mod closure;
 mod crossings;
 mod findings;
+mod inside;
 mod pieces;
 mod prepare;
 mod scatter;
 #[cfg(test)]
 mod testing;
+mod to_levelset;
 mod topology;
 mod winding;
 
@@ -16,6 +19,7 @@ pub use bvh::{Bvh, Hit};
 pub use findings::MeshFindings;
 pub use prepare::{prepare, weld_equal};
 pub use scatter::{UnsignedLeaf, distance_to_triangles};
+pub use to_levelset::{MeshToLevelSet, mesh_to_level_set};
 pub use topology::{Topology, analyze};
 pub use winding::WindingNumber;
 
