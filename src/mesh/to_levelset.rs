@@ -414,4 +414,36 @@ mod tests {
         let error = mesh_to_level_set(&quad, &MeshToLevelSet::new(1e-4), &run).err().unwrap();
         assert_eq!(error.exit_code(), 5, "{error}");
     }
+
+    #[test]
+    #[ignore]
+    fn survey() {
+        for file in std::env::var("SURVEY").unwrap().split(',') {
+            let Some(mesh) = shared_mesh(file) else { continue };
+            let (lo, hi) = mesh.bounding_box().unwrap();
+            let n: f64 = std::env::var("RES").map_or(128.0, |r| r.parse().unwrap());
+            let start = std::time::Instant::now();
+            match convert(&mesh, (hi - lo).max_element() / n) {
+                Err(e) => println!("{file}: ERROR {e}"),
+                Ok((ls, f)) => {
+                    let t = start.elapsed();
+                    println!(
+                        "{file}: {t:?} leaves {} active {} closure {} removed {:.4} si {} {:?}",
+                        ls.grid().leaves().len(),
+                        ls.grid().active_voxels(),
+                        f.closure_triangles,
+                        f.removed_area_fraction,
+                        f.self_intersecting,
+                        f.warnings()
+                    );
+                    let v = std::panic::catch_unwind(|| check_valid(&ls));
+                    println!(
+                        "     volume {v:?} mesh {}",
+                        f.converted.signed_volume
+                            * ((hi - lo).max_element() / n).powi(if std::env::var("X").is_ok() { 3 } else { 0 })
+                    );
+                }
+            }
+        }
+    }
 }
