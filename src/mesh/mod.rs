@@ -6,6 +6,7 @@ mod closure;
 mod crossings;
 mod findings;
 mod inside;
+mod intersect;
 mod pieces;
 mod prepare;
 mod scatter;
