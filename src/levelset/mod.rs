@@ -10,6 +10,7 @@ pub mod shapes;
 
 use glam::{DVec3, IVec3};
 
+pub(crate) use build::grid_of_leaves;
 pub use sample::Sampler;
 
 use crate::grid::{Grid, Transform};
