@@ -6,5 +6,7 @@ pub mod error;
 pub mod grid;
 pub mod mesh;
 pub mod run;
+#[cfg(feature = "openvdb")]
+pub mod vdb;
 
 pub use error::{EditError, Result};

@@ -1,0 +1,2 @@
+//! .vdb
+mod bridge;
