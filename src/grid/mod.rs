@@ -1,7 +1,277 @@
 //! Sparse storage: leaves of 8³ voxels in pages, found through node tables. Knows nothing of distance.
+//!
+//! A [`Grid`] holds an f32 and an active bit a voxel near a surface, and a sign everywhere else: absent leaves are
+//! all +[`background`](Grid::background) (outside) or all −background (inside). Inactive voxels of a leaf hold ±background as well.
+//!
+//! Leaves live in slots of pages behind `Arc` ([`Paged`]): copying a grid copies page pointers, and writing copies only
+//! the pages that change. The slot of a leaf depends on the grid's history; every list and every sum goes by the order of
+//! origins and does not.
 
+mod accessor;
 mod leaf;
+mod leaf_set;
+mod paged;
+mod topology;
 mod transform;
 
+use std::sync::Arc;
+
+use glam::IVec3;
+use rayon::prelude::*;
+
+pub use accessor::Accessor;
 pub use leaf::{Face, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset, leaf_origin, offset_to_local};
+pub use leaf_set::LeafSet;
+pub use paged::{LeafId, PAGE_LEAVES, PageLeaves, Paged};
+use topology::Topology;
+pub use topology::{Neighbours, neighbour_index};
 pub use transform::Transform;
+
+/// Largest index coordinate of a voxel, either sign: beyond it the arithmetic of neighbours could overflow.
+pub const MAX_COORD: i32 = 1 << 30;
+
+/// A sparse grid of f32 with a sign everywhere. Cheap to clone.
+#[derive(Clone)]
+pub struct Grid {
+    background: f32,
+    topology: Arc<Topology>,
+    values: Paged<LeafValues>,
+    masks: Paged<LeafMask>,
+}
+
+impl Grid {
+    /// A grid without leaves, outside everywhere. `background` must be positive.
+    pub fn empty(background: f32) -> Self {
+        Self::from_origins(background, &[])
+    }
+
+    /// A grid with leaves at `origins` (sorted by x, y, z; multiples of 8; no duplicates), every voxel inactive and outside.
+    pub fn from_origins(background: f32, origins: &[IVec3]) -> Self {
+        debug_assert!(background > 0.0);
+        let topology = Topology::from_origins(origins);
+        let mut values = Paged::filled(1, LeafValues::filled(background));
+        *values.get_mut(LeafId::INSIDE) = LeafValues::filled(-background);
+        values.grow(topology.page_count(), LeafValues::filled(background));
+        let masks = Paged::filled(topology.page_count(), LeafMask::EMPTY);
+        Self { background, topology: Arc::new(topology), values, masks }
+    }
+
+    /// The value that stands for everything outside; its negative for everything inside.
+    pub fn background(&self) -> f32 {
+        self.background
+    }
+
+    /// The leaves in the order of their origins.
+    pub fn leaves(&self) -> &[LeafId] {
+        self.topology.order()
+    }
+
+    /// All leaves as a set.
+    pub fn leaf_set(&self) -> &LeafSet {
+        self.topology.live()
+    }
+
+    /// First voxel of a leaf.
+    pub fn origin(&self, id: LeafId) -> IVec3 {
+        self.topology.origin(id)
+    }
+
+    /// Values of a leaf or sentinel.
+    #[inline(always)]
+    pub fn values(&self, id: LeafId) -> &LeafValues {
+        self.values.get(id)
+    }
+
+    /// Active mask of a leaf; empty for a sentinel.
+    #[inline(always)]
+    pub fn mask(&self, id: LeafId) -> LeafMask {
+        *self.masks.get(id)
+    }
+
+    /// The leaf at `origin` (a multiple of 8), or the sentinel of the sign there.
+    pub fn find(&self, origin: IVec3) -> LeafId {
+        self.topology.find(origin)
+    }
+
+    /// The 27 leaves around and including each leaf, by slot ([`LeafId::index`]). Computed once a topology.
+    pub fn neighbours(&self) -> &[Neighbours] {
+        self.topology.neighbours()
+    }
+
+    /// Value and state of one voxel. For many voxels use an [`Accessor`].
+    pub fn voxel(&self, ijk: IVec3) -> (f32, bool) {
+        let id = self.find(leaf_origin(ijk));
+        let offset = leaf_offset(ijk);
+        (self.values(id).0[offset], self.mask(id).get(offset))
+    }
+
+    /// A reader of single voxels that remembers the last leaf.
+    pub fn accessor(&self) -> Accessor<'_> {
+        Accessor::new(self)
+    }
+
+    /// Number of active voxels.
+    pub fn active_voxels(&self) -> u64 {
+        self.leaves().iter().map(|&id| u64::from(self.mask(id).count())).sum()
+    }
+
+    /// Smallest box of voxels around the active ones, both ends included; `None` if there are none.
+    pub fn active_bounds(&self) -> Option<(IVec3, IVec3)> {
+        self.map_leaves(|id| {
+            let mask = self.mask(id);
+            let bounds = mask.iter().map(offset_to_local).map(|p| (p, p)).reduce(join_bounds)?;
+            Some((bounds.0 + self.origin(id), bounds.1 + self.origin(id)))
+        })
+        .into_iter()
+        .flatten()
+        .reduce(join_bounds)
+    }
+
+    /// Bytes held, shared pages included.
+    pub fn bytes(&self) -> u64 {
+        self.values.bytes() + self.masks.bytes() + self.topology.bytes()
+    }
+
+    /// `f` of every leaf, in the order of origins, computed in parallel.
+    pub fn map_leaves<R: Send>(&self, f: impl Fn(LeafId) -> R + Sync) -> Vec<R> {
+        self.leaves().par_iter().with_min_len(16).map(|&id| f(id)).collect()
+    }
+
+    /// Sum of `f` over the leaves, added up in the order of origins: the same bits for any number of threads.
+    pub fn sum_leaves(&self, f: impl Fn(LeafId) -> f64 + Sync) -> f64 {
+        self.map_leaves(f).into_iter().sum()
+    }
+
+    /// Changes the values and masks of the leaves of `set`, in parallel. Inactive voxels must be left at ±background.
+    pub fn update(&mut self, set: &LeafSet, f: impl Fn(LeafId, &mut LeafValues, &mut LeafMask) + Sync) {
+        self.values.par_update_pages_with(&mut self.masks, set, |leaves, values, masks| {
+            leaves.for_each(|id| f(id, &mut values[PageLeaves::slot(id)], &mut masks[PageLeaves::slot(id)]));
+        });
+    }
+
+    /// Changes the values and masks of all leaves, in parallel.
+    pub fn update_all(&mut self, f: impl Fn(LeafId, &mut LeafValues, &mut LeafMask) + Sync) {
+        let set = self.leaf_set().clone();
+        self.update(&set, f);
+    }
+
+    /// The pages of values, for kernels that write to a second buffer.
+    pub fn value_pages(&self) -> &Paged<LeafValues> {
+        &self.values
+    }
+
+    /// Exchanges the values with a second buffer of the same topology.
+    pub(crate) fn swap_values(&mut self, buffer: &mut Paged<LeafValues>) {
+        debug_assert_eq!(self.values.page_count(), buffer.page_count());
+        std::mem::swap(&mut self.values, buffer);
+    }
+
+    /// Adds leaves at `origins` (sorted, no leaf there yet): all voxels inactive, with the sign that the space had. Returns their ids.
+    pub fn add_leaves(&mut self, origins: &[IVec3]) -> Vec<LeafId> {
+        if origins.is_empty() {
+            return Vec::new();
+        }
+        let topology = Arc::make_mut(&mut self.topology);
+        let added = topology.insert(origins);
+        self.values.grow(topology.page_count(), LeafValues::filled(self.background));
+        self.masks.grow(topology.page_count(), LeafMask::EMPTY);
+        for &(id, sentinel) in &added {
+            let value = if sentinel == LeafId::INSIDE { -self.background } else { self.background };
+            self.values.get_mut(id).0.fill(value);
+            *self.masks.get_mut(id) = LeafMask::EMPTY;
+        }
+        added.into_iter().map(|(id, _)| id).collect()
+    }
+
+    /// Removes those of `candidates` that have no active voxel and one sign, which stays known.
+    pub fn prune(&mut self, candidates: &LeafSet) -> Vec<LeafId> {
+        let removed: Vec<_> = candidates
+            .iter()
+            .filter(|&id| self.mask(id).is_empty())
+            .filter_map(|id| {
+                let values = &self.values(id).0;
+                let inside = values[0] < 0.0;
+                values.iter().all(|v| (*v < 0.0) == inside).then_some((id, LeafId::sentinel(inside)))
+            })
+            .collect();
+        if !removed.is_empty() {
+            Arc::make_mut(&mut self.topology).remove(&removed);
+        }
+        removed.into_iter().map(|(id, _)| id).collect()
+    }
+
+    /// Gives all absent leaves in the box of voxels `lo..hi` (multiples of 8, `hi` excluded) a sign.
+    pub fn set_sign(&mut self, lo: IVec3, hi: IVec3, inside: bool) {
+        Arc::make_mut(&mut self.topology).set_sign(lo, hi, inside);
+    }
+
+    /// Gives every absent leaf its sign, from the leaves: the surface must be closed, and the last voxel in z of each
+    /// row of every leaf's border must have the sign of the space beyond.
+    pub fn flood_signs(&mut self) {
+        let values = &self.values;
+        Arc::make_mut(&mut self.topology).flood_signs(|id| values.get(id).0[7] < 0.0);
+    }
+
+    /// Boxes of absent leaves inside the surface: first voxel and edge in voxels (8, or 128 for a whole node), by origin.
+    pub fn inside_tiles(&self) -> Vec<(IVec3, i32)> {
+        self.topology.inside_tiles()
+    }
+
+    /// Whether two grids share the storage of a leaf: true after a copy until either writes near it.
+    pub fn shares_storage(&self, other: &Self, id: LeafId) -> bool {
+        self.values.shares_page(&other.values, id)
+    }
+}
+
+fn join_bounds(a: (IVec3, IVec3), b: (IVec3, IVec3)) -> (IVec3, IVec3) {
+    (a.0.min(b.0), a.1.max(b.1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn voxels_leaves_and_signs() {
+        let origins = [IVec3::new(-8, 0, 0), IVec3::new(0, 0, 0), IVec3::new(0, 0, 128)];
+        let mut grid = Grid::from_origins(3.0, &origins);
+        grid.update_all(|id, values, mask| {
+            values.0[9] = id.index() as f32;
+            mask.set(9, true);
+        });
+        let id = grid.find(IVec3::ZERO);
+        assert_eq!(grid.voxel(IVec3::new(0, 1, 1)), (id.index() as f32, true));
+        assert_eq!(grid.voxel(IVec3::new(0, 1, 2)), (3.0, false));
+        assert_eq!(grid.active_voxels(), 3);
+        assert_eq!(grid.active_bounds(), Some((IVec3::new(-8, 1, 1), IVec3::new(0, 1, 129))));
+        grid.set_sign(IVec3::new(0, 0, 8), IVec3::new(8, 8, 128), true);
+        assert_eq!(grid.voxel(IVec3::new(3, 3, 60)), (-3.0, false));
+        assert_eq!(grid.inside_tiles().len(), 15);
+    }
+
+    #[test]
+    fn a_copy_is_shared_until_written_and_pruning_keeps_the_sign() {
+        let origins: Vec<_> = (0..200).map(|z| IVec3::new(0, 0, 8 * z)).collect();
+        let mut grid = Grid::from_origins(1.0, &origins);
+        grid.update_all(|_, values, mask| {
+            values.0.fill(-0.5);
+            *mask = LeafMask::FULL;
+        });
+        let copy = grid.clone();
+        let first = grid.find(IVec3::ZERO);
+        let last = grid.find(IVec3::new(0, 0, 8 * 199));
+        let only_first: LeafSet = [first].into_iter().collect();
+        grid.update(&only_first, |_, values, mask| {
+            values.0.fill(-1.0);
+            *mask = LeafMask::EMPTY;
+        });
+        assert!(!grid.shares_storage(&copy, first));
+        assert!(grid.shares_storage(&copy, last));
+        assert_eq!(copy.voxel(IVec3::ZERO), (-0.5, true));
+        let all = grid.leaf_set().clone();
+        assert_eq!(grid.prune(&all), [first]);
+        assert_eq!(grid.voxel(IVec3::ZERO), (-1.0, false));
+        assert_eq!(grid.leaves().len(), 199);
+        assert_eq!(copy.leaves().len(), 200);
+    }
+}

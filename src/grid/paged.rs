@@ -1,0 +1,195 @@
+//! Per-leaf data in pages of 64, shared until written.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use super::leaf_set::LeafSet;
+
+/// Leaves in a page: 128 KiB of values, the size of one parallel task.
+pub const PAGE_LEAVES: usize = 64;
+
+/// The slot of a leaf in a grid's pages.
+///
+/// The first page of every grid holds two sentinels that stand for all absent leaves, so that a neighbour always has
+/// values and no kernel needs a branch: [`OUTSIDE`](Self::OUTSIDE) is all +background, [`INSIDE`](Self::INSIDE) all −background.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct LeafId(u32);
+
+impl LeafId {
+    /// Stands for an absent leaf outside the surface.
+    pub const OUTSIDE: Self = Self(0);
+    /// Stands for an absent leaf inside the surface.
+    pub const INSIDE: Self = Self(1);
+
+    /// The id of slot `index`.
+    pub(crate) fn new(index: usize) -> Self {
+        Self(index as u32)
+    }
+
+    /// The sentinel of a sign.
+    pub fn sentinel(inside: bool) -> Self {
+        if inside { Self::INSIDE } else { Self::OUTSIDE }
+    }
+
+    /// Whether this is one of the sentinels: no leaf is stored there.
+    pub fn is_sentinel(self) -> bool {
+        self.0 < 2
+    }
+
+    /// The slot as an index.
+    pub fn index(self) -> usize {
+        self.0 as usize
+    }
+
+    pub(crate) fn page(self) -> usize {
+        self.0 as usize / PAGE_LEAVES
+    }
+
+    pub(crate) fn slot(self) -> usize {
+        self.0 as usize % PAGE_LEAVES
+    }
+}
+
+/// One `T` a leaf slot, in pages of [`PAGE_LEAVES`] behind `Arc`: a clone copies page pointers, a write copies only the
+/// page that it touches while that page is shared.
+#[derive(Clone, Debug, Default)]
+pub struct Paged<T> {
+    pages: Vec<Arc<[T]>>,
+}
+
+impl<T: Clone + Send + Sync> Paged<T> {
+    /// `pages` pages that share one page of `value`.
+    pub fn filled(pages: usize, value: T) -> Self {
+        Self { pages: vec![Self::page_of(value); pages] }
+    }
+
+    fn page_of(value: T) -> Arc<[T]> {
+        std::iter::repeat_n(value, PAGE_LEAVES).collect()
+    }
+
+    /// Number of pages.
+    pub fn page_count(&self) -> usize {
+        self.pages.len()
+    }
+
+    /// Appends pages of `value` until there are `pages`.
+    pub fn grow(&mut self, pages: usize, value: T) {
+        if self.pages.len() < pages {
+            self.pages.resize(pages, Self::page_of(value));
+        }
+    }
+
+    /// Drops the pages from `pages` on.
+    pub fn truncate(&mut self, pages: usize) {
+        self.pages.truncate(pages);
+    }
+
+    /// The entry of a leaf.
+    #[inline(always)]
+    pub fn get(&self, id: LeafId) -> &T {
+        &self.pages[id.page()][id.slot()]
+    }
+
+    /// The entry of a leaf for writing; its page is copied first if it is shared.
+    pub fn get_mut(&mut self, id: LeafId) -> &mut T {
+        &mut Arc::make_mut(&mut self.pages[id.page()])[id.slot()]
+    }
+
+    /// Whether two arrays share the storage of a leaf's page.
+    pub fn shares_page(&self, other: &Self, id: LeafId) -> bool {
+        Arc::ptr_eq(&self.pages[id.page()], &other.pages[id.page()])
+    }
+
+    /// Calls `f` with every page that holds a leaf of `set`, in parallel, one task a page. Other pages stay shared.
+    pub fn par_update_pages<R, F>(&mut self, set: &LeafSet, f: F) -> Vec<R>
+    where
+        R: Send,
+        F: Fn(PageLeaves, &mut [T]) -> R + Sync,
+    {
+        self.pages
+            .par_iter_mut()
+            .enumerate()
+            .filter_map(|(page, data)| {
+                let word = set.word(page);
+                (word != 0).then(|| f(PageLeaves { page, word }, Arc::make_mut(data)))
+            })
+            .collect()
+    }
+
+    /// As [`par_update_pages`](Self::par_update_pages) over two arrays of one grid at once.
+    pub fn par_update_pages_with<U, R, F>(&mut self, other: &mut Paged<U>, set: &LeafSet, f: F) -> Vec<R>
+    where
+        U: Clone + Send + Sync,
+        R: Send,
+        F: Fn(PageLeaves, &mut [T], &mut [U]) -> R + Sync,
+    {
+        self.pages
+            .par_iter_mut()
+            .zip(&mut other.pages)
+            .enumerate()
+            .filter_map(|(page, (a, b))| {
+                let word = set.word(page);
+                (word != 0).then(|| f(PageLeaves { page, word }, Arc::make_mut(a), Arc::make_mut(b)))
+            })
+            .collect()
+    }
+
+    /// Calls `f` with every leaf of `set`, in parallel over pages.
+    pub fn par_update(&mut self, set: &LeafSet, f: impl Fn(LeafId, &mut T) + Sync) {
+        self.par_update_pages(set, |leaves, data| leaves.for_each(|id| f(id, &mut data[id.slot()])));
+    }
+
+    /// Bytes of the pages, shared ones included.
+    pub fn bytes(&self) -> u64 {
+        (self.pages.len() * PAGE_LEAVES * size_of::<T>()) as u64
+    }
+}
+
+/// The leaves of a set that lie in one page.
+#[derive(Clone, Copy)]
+pub struct PageLeaves {
+    page: usize,
+    word: u64,
+}
+
+impl PageLeaves {
+    /// Calls `f` with each leaf, in slot order.
+    #[inline(always)]
+    pub fn for_each(self, mut f: impl FnMut(LeafId)) {
+        let mut rest = self.word;
+        while rest != 0 {
+            let slot = rest.trailing_zeros() as usize;
+            rest &= rest - 1;
+            f(LeafId::new(self.page * PAGE_LEAVES + slot));
+        }
+    }
+
+    /// The entry of a leaf of this page in the page's slice.
+    #[inline(always)]
+    pub fn slot(id: LeafId) -> usize {
+        id.slot()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_write_copies_only_its_page() {
+        let mut a: Paged<u32> = Paged::filled(3, 7);
+        let mut set = LeafSet::default();
+        for slot in [70, 130] {
+            set.insert(LeafId::new(slot));
+        }
+        a.par_update(&set, |id, v| *v = id.index() as u32);
+        let b = a.clone();
+        *a.get_mut(LeafId::new(70)) += 1;
+        assert_eq!((*a.get(LeafId::new(70)), *b.get(LeafId::new(70))), (71, 70));
+        assert!(!a.shares_page(&b, LeafId::new(70)));
+        assert!(a.shares_page(&b, LeafId::new(130)));
+        assert_eq!(*a.get(LeafId::new(130)), 130);
+        assert_eq!(*a.get(LeafId::new(131)), 7);
+    }
+}

@@ -1,0 +1,421 @@
+//! Where leaves are: node tables over 16³ leaves, the order of origins, free slots, neighbours.
+//!
+//! A node covers 128³ voxels and is a dense table with an entry for each of its 16³ leaves: the slot of a leaf, or the
+//! sentinel of the sign that the space there has. So the sign of every point is known, and the neighbours of a leaf are
+//! read from tables; a hash finds nodes only. A node without a table is outside.
+
+use std::sync::{Arc, OnceLock};
+
+use glam::IVec3;
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use super::leaf::LEAF_DIM;
+use super::leaf_set::LeafSet;
+use super::paged::{LeafId, PAGE_LEAVES};
+
+/// Leaves along the edge of a node.
+const NODE_LEAVES: i32 = 16;
+/// Voxels along the edge of a node.
+pub(crate) const NODE_DIM: i32 = NODE_LEAVES * LEAF_DIM;
+/// Entries of a node table.
+const NODE_ENTRIES: usize = (NODE_LEAVES * NODE_LEAVES * NODE_LEAVES) as usize;
+
+/// The entries of a node, z fastest.
+type NodeTable = [LeafId; NODE_ENTRIES];
+
+/// A leaf and its 26 neighbours: entry `(dx+1)·9 + (dy+1)·3 + (dz+1)`; 13 is the leaf itself.
+pub type Neighbours = [LeafId; 27];
+
+#[derive(Clone, Default)]
+pub(super) struct Topology {
+    nodes: FxHashMap<IVec3, Arc<NodeTable>>,
+    /// Origin of the leaf in each slot; of no meaning for sentinels and free slots.
+    origins: Vec<IVec3>,
+    /// The leaves, by origin: x, then y, then z.
+    order: Vec<LeafId>,
+    live: LeafSet,
+    /// Slots of removed leaves, the next one to use last.
+    free: Vec<LeafId>,
+    neighbours: OnceLock<Vec<Neighbours>>,
+}
+
+/// Sort key of origins: x, then y, then z.
+fn key(origin: IVec3) -> (i32, i32, i32) {
+    (origin.x, origin.y, origin.z)
+}
+
+fn node_of(origin: IVec3) -> IVec3 {
+    origin >> 7
+}
+
+fn entry_of(origin: IVec3) -> usize {
+    entry_of_leaf(origin >> 3)
+}
+
+/// Entry of the leaf at `leaf`, counted in leaves.
+fn entry_of_leaf(leaf: IVec3) -> usize {
+    let local: IVec3 = leaf & (NODE_LEAVES - 1);
+    ((local.x << 8) | (local.y << 4) | local.z) as usize
+}
+
+impl Topology {
+    /// Leaves at `origins`, which must be sorted by (x, y, z), without duplicates and multiples of 8. All space between is outside.
+    pub fn from_origins(origins: &[IVec3]) -> Self {
+        debug_assert!(origins.is_sorted_by(|a, b| key(*a) < key(*b)));
+        let mut topology = Self { origins: vec![IVec3::ZERO; PAGE_LEAVES], ..Self::default() };
+        topology.origins.extend_from_slice(origins);
+        topology.order = (0..origins.len()).map(|i| LeafId::new(PAGE_LEAVES + i)).collect();
+        topology.live = topology.order.iter().copied().collect();
+        for (&origin, &id) in origins.iter().zip(&topology.order) {
+            set_entry(&mut topology.nodes, origin, id);
+        }
+        topology
+    }
+
+    /// The leaves in the order of their origins.
+    pub fn order(&self) -> &[LeafId] {
+        &self.order
+    }
+
+    pub fn live(&self) -> &LeafSet {
+        &self.live
+    }
+
+    pub fn origin(&self, id: LeafId) -> IVec3 {
+        self.origins[id.index()]
+    }
+
+    /// Pages that the slots need.
+    pub fn page_count(&self) -> usize {
+        self.origins.len().div_ceil(PAGE_LEAVES)
+    }
+
+    /// The leaf at `origin`, or the sentinel of the sign there.
+    pub fn find(&self, origin: IVec3) -> LeafId {
+        self.nodes.get(&node_of(origin)).map_or(LeafId::OUTSIDE, |table| table[entry_of(origin)])
+    }
+
+    /// Bytes of tables and lists.
+    pub fn bytes(&self) -> u64 {
+        let per_leaf = size_of::<IVec3>() + size_of::<LeafId>() + 27 * size_of::<LeafId>();
+        (self.nodes.len() * size_of::<NodeTable>() + self.origins.len() * per_leaf) as u64
+    }
+
+    /// Adds leaves at `origins` (sorted, no leaf there yet); returns them with the sentinel that they replace.
+    pub fn insert(&mut self, origins: &[IVec3]) -> Vec<(LeafId, LeafId)> {
+        let mut added = Vec::with_capacity(origins.len());
+        for &origin in origins {
+            let id = self.free.pop().unwrap_or_else(|| {
+                self.origins.push(IVec3::ZERO);
+                LeafId::new(self.origins.len() - 1)
+            });
+            self.origins[id.index()] = origin;
+            self.live.insert(id);
+            added.push((id, set_entry(&mut self.nodes, origin, id)));
+        }
+        self.merge_order(&added);
+        if let Some(mut table) = self.neighbours.take() {
+            table.resize(self.origins.len(), [LeafId::OUTSIDE; 27]);
+            for &(id, _) in &added {
+                let around = self.neighbours_of(id, &mut NodeCache::default());
+                table[id.index()] = around;
+                relink(&mut table, &around, |_| id);
+            }
+            self.neighbours = OnceLock::from(table);
+        }
+        added
+    }
+
+    /// Removes leaves (in the order of origins), leaving the sentinel of each one's sign in its place.
+    pub fn remove(&mut self, removed: &[(LeafId, LeafId)]) {
+        if removed.is_empty() {
+            return;
+        }
+        for &(id, sentinel) in removed {
+            set_entry(&mut self.nodes, self.origins[id.index()], sentinel);
+            self.live.remove(id);
+            self.free.push(id);
+        }
+        self.order.retain(|id| self.live.contains(*id));
+        if let Some(table) = self.neighbours.get_mut() {
+            for &(id, sentinel) in removed {
+                let around = table[id.index()];
+                relink(table, &around, |_| sentinel);
+            }
+        }
+    }
+
+    fn merge_order(&mut self, added: &[(LeafId, LeafId)]) {
+        let old = std::mem::take(&mut self.order);
+        let mut order = Vec::with_capacity(old.len() + added.len());
+        let mut news = added.iter().map(|a| a.0).peekable();
+        for id in old {
+            while let Some(new) = news.next_if(|n| key(self.origins[n.index()]) < key(self.origins[id.index()])) {
+                order.push(new);
+            }
+            order.push(id);
+        }
+        order.extend(news);
+        self.order = order;
+    }
+
+    /// The neighbours of every leaf by slot, computed at the first call and kept up to date from then on.
+    pub fn neighbours(&self) -> &[Neighbours] {
+        self.neighbours.get_or_init(|| {
+            let mut table = vec![[LeafId::OUTSIDE; 27]; self.origins.len()];
+            table.par_chunks_mut(PAGE_LEAVES).enumerate().for_each(|(page, chunk)| {
+                let mut cache = NodeCache::default();
+                for (slot, around) in chunk.iter_mut().enumerate() {
+                    let id = LeafId::new(page * PAGE_LEAVES + slot);
+                    if self.live.contains(id) {
+                        *around = self.neighbours_of(id, &mut cache);
+                    }
+                }
+            });
+            table
+        })
+    }
+
+    fn neighbours_of<'a>(&'a self, id: LeafId, cache: &mut NodeCache<'a>) -> Neighbours {
+        let origin = self.origin(id);
+        let tables = cache.around(self, node_of(origin));
+        let local: IVec3 = (origin >> 3) & (NODE_LEAVES - 1);
+        std::array::from_fn(|q| {
+            let leaf = local + neighbour_step(q);
+            // -1, 0 or 1 for the node below, this one, the node above.
+            let node = leaf >> 4;
+            let table = tables[neighbour_index(node)];
+            table.map_or(LeafId::OUTSIDE, |t| t[entry_of_leaf(leaf)])
+        })
+    }
+
+    /// Gives all absent leaves in the box of leaf origins `lo..hi` (exclusive) the sign `inside`.
+    pub fn set_sign(&mut self, lo: IVec3, hi: IVec3, inside: bool) {
+        let sentinel = LeafId::sentinel(inside);
+        let (node_lo, node_hi) = (node_of(lo), node_of(hi - 1));
+        for nx in node_lo.x..=node_hi.x {
+            for ny in node_lo.y..=node_hi.y {
+                for nz in node_lo.z..=node_hi.z {
+                    let node = IVec3::new(nx, ny, nz);
+                    let from = lo.max(node * NODE_DIM);
+                    let to = hi.min((node + 1) * NODE_DIM);
+                    let whole = to - from == IVec3::splat(NODE_DIM);
+                    match self.nodes.get_mut(&node) {
+                        None if whole => {
+                            self.nodes.insert(node, Arc::new([sentinel; NODE_ENTRIES]));
+                        }
+                        table => {
+                            let table = match table {
+                                Some(table) => table,
+                                None => self.nodes.entry(node).or_insert_with(outside_table),
+                            };
+                            let table = Arc::make_mut(table);
+                            for_each_origin(from, to, |origin| {
+                                let entry = &mut table[entry_of(origin)];
+                                if entry.is_sentinel() {
+                                    *entry = sentinel;
+                                }
+                            });
+                        }
+                    }
+                }
+            }
+        }
+        self.neighbours = OnceLock::new();
+    }
+
+    /// Gives every absent leaf the sign of the surface around it: along each row of leaves in z the sign is outside until
+    /// a leaf is met, and then `leaves_inside(leaf)`, the sign at that leaf's last z, until the next. The surface must be closed.
+    pub fn flood_signs(&mut self, leaves_inside: impl Fn(LeafId) -> bool + Sync) {
+        let mut columns: FxHashMap<(i32, i32), Vec<i32>> = FxHashMap::default();
+        for node in self.nodes.keys() {
+            columns.entry((node.x, node.y)).or_default().push(node.z);
+        }
+        let columns: Vec<_> = columns.into_iter().collect();
+        let nodes = &self.nodes;
+        let flooded: Vec<(IVec3, Arc<NodeTable>)> = columns
+            .into_par_iter()
+            .flat_map_iter(|((x, y), mut zs)| {
+                zs.sort_unstable();
+                let mut out = Vec::with_capacity(zs.len());
+                // The sign of each of the 16² rows of leaves as the scan rises.
+                let mut inside = [false; 256];
+                let mut last_z = None;
+                for z in zs {
+                    if inside.iter().all(|i| *i) {
+                        // Nodes without any leaf between two that have some: solid all through.
+                        out.extend(
+                            (last_z.map_or(z, |l: i32| l + 1)..z)
+                                .map(|z| (IVec3::new(x, y, z), Arc::new([LeafId::INSIDE; NODE_ENTRIES]))),
+                        );
+                    }
+                    last_z = Some(z);
+                    let node = IVec3::new(x, y, z);
+                    let mut table = *nodes[&node];
+                    for (row, inside) in inside.iter_mut().enumerate() {
+                        for entry in &mut table[row * 16..(row + 1) * 16] {
+                            if entry.is_sentinel() {
+                                *entry = LeafId::sentinel(*inside);
+                            } else {
+                                *inside = leaves_inside(*entry);
+                            }
+                        }
+                    }
+                    out.push((node, Arc::new(table)));
+                }
+                out
+            })
+            .collect();
+        self.nodes.extend(flooded);
+        self.neighbours = OnceLock::new();
+    }
+
+    /// Boxes of absent leaves that are inside, each as its first origin and its edge in voxels (8, or 128 for a whole node), by origin.
+    pub fn inside_tiles(&self) -> Vec<(IVec3, i32)> {
+        let mut tiles = Vec::new();
+        for (&node, table) in &self.nodes {
+            if table.iter().all(|e| *e == LeafId::INSIDE) {
+                tiles.push((node * NODE_DIM, NODE_DIM));
+                continue;
+            }
+            let base = node * NODE_DIM;
+            for_each_origin(base, base + NODE_DIM, |origin| {
+                if table[entry_of(origin)] == LeafId::INSIDE {
+                    tiles.push((origin, LEAF_DIM));
+                }
+            });
+        }
+        tiles.sort_unstable_by_key(|(origin, _)| key(*origin));
+        tiles
+    }
+}
+
+fn outside_table() -> Arc<NodeTable> {
+    Arc::new([LeafId::OUTSIDE; NODE_ENTRIES])
+}
+
+/// Puts `id` into the table at `origin`; returns what was there.
+fn set_entry(nodes: &mut FxHashMap<IVec3, Arc<NodeTable>>, origin: IVec3, id: LeafId) -> LeafId {
+    let table = nodes.entry(node_of(origin)).or_insert_with(outside_table);
+    std::mem::replace(&mut Arc::make_mut(table)[entry_of(origin)], id)
+}
+
+/// Tells every leaf of `around` what now lies in its centre's place.
+fn relink(table: &mut [Neighbours], around: &Neighbours, entry: impl Fn(LeafId) -> LeafId) {
+    for (q, &n) in around.iter().enumerate() {
+        if q != 13 && !n.is_sentinel() {
+            table[n.index()][26 - q] = entry(n);
+        }
+    }
+}
+
+fn for_each_origin(lo: IVec3, hi: IVec3, mut f: impl FnMut(IVec3)) {
+    for x in (lo.x..hi.x).step_by(LEAF_DIM as usize) {
+        for y in (lo.y..hi.y).step_by(LEAF_DIM as usize) {
+            for z in (lo.z..hi.z).step_by(LEAF_DIM as usize) {
+                f(IVec3::new(x, y, z));
+            }
+        }
+    }
+}
+
+/// Index in [`Neighbours`] of the neighbour at `step` (each component −1, 0 or 1).
+pub fn neighbour_index(step: IVec3) -> usize {
+    ((step.x + 1) * 9 + (step.y + 1) * 3 + step.z + 1) as usize
+}
+
+fn neighbour_step(index: usize) -> IVec3 {
+    let q = index as i32;
+    IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1)
+}
+
+/// The tables around the last node asked for: leaves come in runs of one node.
+#[derive(Default)]
+struct NodeCache<'a> {
+    centre: Option<IVec3>,
+    tables: [Option<&'a NodeTable>; 27],
+}
+
+impl<'a> NodeCache<'a> {
+    fn around(&mut self, topology: &'a Topology, node: IVec3) -> &[Option<&'a NodeTable>; 27] {
+        if self.centre != Some(node) {
+            self.centre = Some(node);
+            self.tables =
+                std::array::from_fn(|q| topology.nodes.get(&(node + neighbour_step(q))).map(|table| &**table));
+        }
+        &self.tables
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sorted(mut origins: Vec<IVec3>) -> Vec<IVec3> {
+        origins.sort_unstable_by_key(|o| key(*o));
+        origins.dedup();
+        origins
+    }
+
+    /// Leaves around node borders, on both sides of zero.
+    fn scattered() -> Vec<IVec3> {
+        sorted((0..400).map(|i| IVec3::new(i * 37 % 29 - 14, i * 53 % 31 - 16, i * 71 % 37 - 18) * 8).collect())
+    }
+
+    #[test]
+    fn neighbours_equal_look_ups_after_any_history() {
+        let origins = scattered();
+        let mut topology = Topology::from_origins(&origins);
+        let check = |t: &Topology| {
+            for &id in t.order() {
+                for (q, &n) in t.neighbours()[id.index()].iter().enumerate() {
+                    assert_eq!(n, t.find(t.origin(id) + neighbour_step(q) * 8));
+                }
+            }
+            assert!(t.order().is_sorted_by_key(|id| key(t.origin(*id))));
+            assert_eq!(t.order().len(), t.live().len());
+        };
+        check(&topology);
+        let removed: Vec<_> = topology.order().iter().copied().step_by(3).map(|id| (id, LeafId::INSIDE)).collect();
+        topology.remove(&removed);
+        check(&topology);
+        let absent: Vec<_> =
+            (-20..20).map(|i| IVec3::new(i, 2 * i, -i) * 8).filter(|o| topology.find(*o).is_sentinel()).collect();
+        let pages = topology.page_count();
+        let added = topology.insert(&sorted(absent.clone()));
+        assert_eq!(added.len(), absent.len());
+        check(&topology);
+        assert_eq!(topology.page_count(), pages, "freed slots are used again");
+    }
+
+    #[test]
+    fn flood_fills_a_hollow_shell_across_nodes() {
+        // A box of leaves with walls one leaf thick, its inside crossing several nodes.
+        let on_wall = |o: IVec3| o.min_element() == -20 || o.max_element() == 20;
+        let mut origins = Vec::new();
+        for x in -20..=20 {
+            for y in -20..=20 {
+                for z in -20..=20 {
+                    let o = IVec3::new(x, y, z);
+                    if on_wall(o) {
+                        origins.push(o * 8);
+                    }
+                }
+            }
+        }
+        let mut topology = Topology::from_origins(&origins);
+        // Walls face inwards on the low side and outwards on the high side; rows inside the side walls end outside.
+        let o = topology.origins.clone();
+        topology.flood_signs(|id| {
+            let o = o[id.index()] / 8;
+            o.z == -20 && o.x.abs() < 20 && o.y.abs() < 20
+        });
+        assert_eq!(topology.find(IVec3::ZERO), LeafId::INSIDE);
+        assert_eq!(topology.find(IVec3::splat(19 * 8)), LeafId::INSIDE);
+        assert_eq!(topology.find(IVec3::new(0, 0, 21 * 8)), LeafId::OUTSIDE);
+        assert_eq!(topology.find(IVec3::new(1000, 0, 0)), LeafId::OUTSIDE);
+        let inside: i64 = topology.inside_tiles().iter().map(|(_, edge)| (*edge as i64 / 8).pow(3)).sum();
+        assert_eq!(inside, 39 * 39 * 39);
+    }
+}
