@@ -111,10 +111,8 @@ public:
     void add_leaves(rust::Slice<const std::int32_t> origins);
     /// Fills leaves from `first` on, in the order they were added. Disjoint ranges may be filled in parallel.
     void fill(std::size_t first, rust::Slice<const float> values, rust::Slice<const std::uint64_t> masks) const;
-    /// Gives the empty slots of nodes of 16^3 leaves (see Leaves::node_inside) the value -background where the bit is set.
-    void set_node_inside(rust::Slice<const std::int32_t> origins, rust::Slice<const std::uint64_t> inside);
-    /// Sets a tile of size 8, 128 or 4096.
-    void add_tile(const Tile& tile);
+    /// Sets tiles, none of which may cover a leaf.
+    void add_tiles(rust::Slice<const Tile> tiles);
     /// Signs of everything that no leaf covers, from the leaves' own signs.
     void flood_fill();
 

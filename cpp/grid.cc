@@ -18,7 +18,6 @@ namespace {
 constexpr std::size_t kLeafVoxels = 512;
 constexpr std::size_t kMaskWords = 8;
 constexpr std::size_t kNodeWords = 64; // 16^3 slots
-constexpr openvdb::Index kNodeSlots = 4096;
 
 void require(bool holds, const char* what)
 {
@@ -121,7 +120,7 @@ public:
                 if (it.isValueOn() || it.getValue() < 0) add(it.getCoord(), 128, it.getValue(), it.isValueOn());
             }
         }
-        for (auto it = grid_->tree().cbeginRootTiles(); it; ++it) {
+        for (auto it = grid_->tree().root().cbeginValueAll(); it; ++it) {
             if (it.isValueOn() || it.getValue() < 0) add(it.getCoord(), 4096, it.getValue(), it.isValueOn());
         }
     }
@@ -139,7 +138,7 @@ public:
         };
         for (const Lower* node : lower_) scan(node->cbeginChildOff());
         for (const Upper* node : upper_) scan(node->cbeginChildOff());
-        scan(grid_->tree().cbeginRootTiles());
+        scan(grid_->tree().root().cbeginValueAll());
     }
 
 private:
@@ -243,41 +242,16 @@ void FloatGrid::fill(std::size_t first, rust::Slice<const float> values, rust::S
     }
 }
 
-void FloatGrid::set_node_inside(rust::Slice<const std::int32_t> origins, rust::Slice<const std::uint64_t> inside)
+void FloatGrid::add_tiles(rust::Slice<const Tile> tiles)
 {
-    using Lower = openvdb::FloatTree::RootNodeType::ChildNodeType::ChildNodeType;
-    const std::size_t n = origins.size() / 3;
-    require(origins.size() == n * 3 && inside.size() == n * kNodeWords, "set_node_inside: wrong length");
-    openvdb::FloatTree& tree = impl->grid->tree();
-    const float value = -tree.background();
-    for (std::size_t i = 0; i < n; ++i) {
-        const openvdb::Coord origin(origins[i * 3], origins[i * 3 + 1], origins[i * 3 + 2]);
-        const std::uint64_t* words = inside.data() + i * kNodeWords;
-        Lower* node = tree.probeNode<Lower>(origin);
-        if (!node) {
-            // No leaf here: one tile if everything is inside, single tiles otherwise.
-            if (std::all_of(words, words + kNodeWords, [](std::uint64_t w) { return ~w == 0; })) {
-                tree.addTile(2, origin, value, false);
-                continue;
-            }
-            if (std::all_of(words, words + kNodeWords, [](std::uint64_t w) { return w == 0; })) continue;
-            tree.touchLeaf(origin);
-            node = tree.probeNode<Lower>(origin);
-            node->addTile(0, tree.background(), false);
-        }
-        for (openvdb::Index slot = 0; slot < kNodeSlots; ++slot) {
-            if ((words[slot >> 6] >> (slot & 63) & 1) && !node->getChildMask().isOn(slot)) {
-                node->addTile(slot, value, false);
-            }
-        }
+    openvdb::tree::ValueAccessor<openvdb::FloatTree> accessor(impl->grid->tree());
+    for (const Tile& tile : tiles) {
+        const openvdb::Index level = tile.size == 8 ? 1 : tile.size == 128 ? 2 : tile.size == 4096 ? 3 : 0;
+        require(level > 0, "add_tiles: a tile has an edge of 8, 128 or 4096 voxels");
+        const openvdb::Coord origin(tile.x, tile.y, tile.z);
+        require(accessor.probeConstLeaf(origin) == nullptr, "add_tiles: there is a leaf in the tile's place");
+        accessor.addTile(level, origin, tile.value, tile.active);
     }
-}
-
-void FloatGrid::add_tile(const Tile& tile)
-{
-    const openvdb::Index level = tile.size == 8 ? 1 : tile.size == 128 ? 2 : tile.size == 4096 ? 3 : 0;
-    require(level > 0, "add_tile: a tile has an edge of 8, 128 or 4096 voxels");
-    impl->grid->tree().addTile(level, openvdb::Coord(tile.x, tile.y, tile.z), tile.value, tile.active);
 }
 
 void FloatGrid::flood_fill() { openvdb::tools::signedFloodFill(impl->grid->tree()); }

@@ -95,8 +95,7 @@ pub(super) mod ffi {
         /// # Safety
         /// No two calls at a time may cover the same leaf.
         unsafe fn fill(self: &FloatGrid, first: usize, values: &[f32], masks: &[u64]) -> Result<()>;
-        fn set_node_inside(self: Pin<&mut FloatGrid>, origins: &[i32], inside: &[u64]) -> Result<()>;
-        fn add_tile(self: Pin<&mut FloatGrid>, tile: &Tile) -> Result<()>;
+        fn add_tiles(self: Pin<&mut FloatGrid>, tiles: &[Tile]) -> Result<()>;
         fn flood_fill(self: Pin<&mut FloatGrid>) -> Result<()>;
         fn set_affine(self: Pin<&mut FloatGrid>, matrix: &[f64]) -> Result<()>;
         fn carry(self: Pin<&mut FloatGrid>, archive: &Archive, index: usize, with_transform: bool) -> Result<()>;
