@@ -104,12 +104,6 @@ void initialize()
 rust::String library_version() { return openvdb::getLibraryVersionString(); }
 std::uint32_t newest_file_version() { return openvdb::OPENVDB_FILE_VERSION; }
 
-bool is_known_type(rust::Str type)
-{
-    initialize();
-    return openvdb::GridBase::isRegistered(std::string(type));
-}
-
 void set_threads(std::size_t threads)
 {
     using Control = tbb::global_control;

@@ -43,8 +43,6 @@ void initialize();
 rust::String library_version();
 /// The newest file format that the library reads.
 std::uint32_t newest_file_version();
-/// Whether a grid type such as "Tree_float_5_4_3" can be read.
-bool is_known_type(rust::Str type);
 /// What OpenVDB logged since the last call; nothing of it reaches standard output.
 rust::String take_log();
 /// Limits TBB's parallelism from now on; 0 lifts the limit.
@@ -113,8 +111,6 @@ public:
     void fill(std::size_t first, rust::Slice<const float> values, rust::Slice<const std::uint64_t> masks) const;
     /// Sets tiles, none of which may cover a leaf.
     void add_tiles(rust::Slice<const Tile> tiles);
-    /// Signs of everything that no leaf covers, from the leaves' own signs.
-    void flood_fill();
 
     /// Row-major 4x4, points as columns.
     void set_affine(rust::Slice<const double> matrix);

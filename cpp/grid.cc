@@ -3,7 +3,6 @@
 
 #include "internal.h"
 
-#include <openvdb/tools/SignedFloodFill.h>
 #include <openvdb/tree/ValueAccessor.h>
 
 #include <algorithm>
@@ -253,8 +252,6 @@ void FloatGrid::add_tiles(rust::Slice<const Tile> tiles)
         accessor.addTile(level, origin, tile.value, tile.active);
     }
 }
-
-void FloatGrid::flood_fill() { openvdb::tools::signedFloodFill(impl->grid->tree()); }
 
 openvdb::math::Transform::Ptr linear_transform(rust::Slice<const double> m)
 {

@@ -63,10 +63,8 @@ pub(super) mod ffi {
     unsafe extern "C++" {
         include!("bridge.h");
 
-        fn initialize() -> Result<()>;
         fn library_version() -> Result<String>;
         fn newest_file_version() -> u32;
-        fn is_known_type(type_name: &str) -> Result<bool>;
         fn take_log() -> Result<String>;
         fn set_threads(threads: usize) -> Result<()>;
 
@@ -96,7 +94,6 @@ pub(super) mod ffi {
         /// No two calls at a time may cover the same leaf.
         unsafe fn fill(self: &FloatGrid, first: usize, values: &[f32], masks: &[u64]) -> Result<()>;
         fn add_tiles(self: Pin<&mut FloatGrid>, tiles: &[Tile]) -> Result<()>;
-        fn flood_fill(self: Pin<&mut FloatGrid>) -> Result<()>;
         fn set_affine(self: Pin<&mut FloatGrid>, matrix: &[f64]) -> Result<()>;
         fn carry(self: Pin<&mut FloatGrid>, archive: &Archive, index: usize, with_transform: bool) -> Result<()>;
         fn set_name(self: Pin<&mut FloatGrid>, name: &str) -> Result<()>;
