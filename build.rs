@@ -53,8 +53,8 @@ mod bridge {
     /// Where OpenVDB and what it needs were found.
     struct Installation {
         include: Vec<PathBuf>,
-        /// Folders of libopenvdb and libtbb.
-        lib: [PathBuf; 2],
+        /// The libraries to link: folder and name.
+        lib: Vec<(PathBuf, String)>,
     }
 
     impl Installation {
@@ -79,8 +79,11 @@ mod bridge {
             }
             let mut include = vec![openvdb];
             include.push(locate(&include_dirs, "tbb/global_control.h", "TBB", "libtbb-dev")?);
+            let mut libraries = vec![("openvdb", "libopenvdb-dev"), ("tbb", "libtbb-dev")];
             if version.lines().any(|line| line.trim() == "#define OPENVDB_USE_IMATH_HALF") {
                 include.push(locate(&include_dirs, "Imath/half.h", "Imath", "libimath-dev")?);
+                // OpenVDB's headers use its table of half floats.
+                libraries.push(("Imath", "libimath-dev"));
             }
             if major < FIRST_WITHOUT_BOOST {
                 let what = format!("Boost, whose headers OpenVDB {major} includes");
@@ -88,7 +91,8 @@ mod bridge {
             }
             include.dedup();
 
-            let lib = [locate_library(&lib_dirs, "openvdb", "libopenvdb-dev")?, locate_library(&lib_dirs, "tbb", "libtbb-dev")?];
+            let lib = libraries.into_iter().map(|(name, package)| locate_library(&lib_dirs, name, package));
+            let lib = lib.collect::<Result<_, _>>()?;
             Ok(Self { include, lib })
         }
 
@@ -110,7 +114,7 @@ mod bridge {
             // The generated code calls into the reference, not the other way about, but that calls into the bridge.
             println!("cargo::rustc-link-lib=static=vdb_edit_bridge");
             println!("cargo::rustc-link-lib=static=vdb_edit_reference");
-            for (dir, library) in self.lib.iter().zip(["openvdb", "tbb"]) {
+            for (dir, library) in &self.lib {
                 println!("cargo::rustc-link-search=native={}", dir.display());
                 println!("cargo::rustc-link-lib={library}");
                 if !dir.starts_with("/usr/lib") && !dir.starts_with("/lib") {
@@ -144,10 +148,23 @@ mod bridge {
         found.cloned().ok_or_else(|| missing(&format!("{what} ({header})"), dirs, package))
     }
 
-    fn locate_library(dirs: &[PathBuf], name: &str, package: &str) -> Result<PathBuf, String> {
-        let files = ["so", "dylib", "a"].map(|extension| format!("lib{name}.{extension}"));
-        let found = dirs.iter().find(|dir| files.iter().any(|file| dir.join(file).is_file()));
-        found.cloned().ok_or_else(|| missing(&format!("the library lib{name}"), dirs, package))
+    /// `lib<name>` or a versioned `lib<name>-<version>`: its folder, and its name for the linker.
+    fn locate_library(dirs: &[PathBuf], name: &str, package: &str) -> Result<(PathBuf, String), String> {
+        for dir in dirs {
+            let files = fs::read_dir(dir).into_iter().flatten().flatten();
+            let names = files.filter_map(|file| {
+                let file = file.file_name().into_string().ok()?;
+                let stem = [".so", ".dylib", ".a"].into_iter().find_map(|extension| file.strip_suffix(extension))?;
+                let library = stem.strip_prefix("lib")?;
+                let rest = library.strip_prefix(name)?;
+                (rest.is_empty() || rest.starts_with('-')).then(|| library.to_string())
+            });
+            // The shortest: the plain name where there is one.
+            if let Some(library) = names.min_by_key(|library| (library.len(), library.clone())) {
+                return Ok((dir.clone(), library));
+            }
+        }
+        Err(missing(&format!("the library lib{name}"), dirs, package))
     }
 
     fn missing(what: &str, dirs: &[PathBuf], package: &str) -> String {

@@ -189,30 +189,52 @@ fn every_grid_of_every_real_file_passes_through_an_edit() {
     }
 }
 
+/// Every length near both ends, and many between, must be refused.
+fn assert_cuts_are_errors(bytes: &[u8], what: &str) {
+    let folder = tempfile::tempdir().unwrap();
+    let cut = folder.path().join("cut.vdb");
+    let lengths = (0..bytes.len()).filter(|n| *n < 700 || bytes.len() - n < 40 || n % 997 == 0);
+    for length in lengths {
+        std::fs::write(&cut, &bytes[..length]).unwrap();
+        let error = input_error(vdb::open(&cut));
+        assert!(error.contains("truncated") || error.contains("empty"), "{what} {length}: {error}");
+        input_error(vdb::list(&cut));
+    }
+    std::fs::write(&cut, [bytes, &[0]].concat()).unwrap();
+    assert!(input_error(vdb::open(&cut)).contains("1 bytes follow"), "{what}");
+}
+
 #[test]
 fn files_cut_short_anywhere_are_errors() {
     let folder = tempfile::tempdir().unwrap();
+    let whole = folder.path().join("whole.vdb");
     let level_set = sphere(Transform::uniform(0.1), 6.0);
-    for compression in [Compression::Blosc, Compression::Zip, Compression::None] {
-        let whole = folder.path().join("whole.vdb");
+    for compression in [Compression::Blosc, Compression::None] {
         let options = WriteOptions { compression: Some(compression), ..WriteOptions::default() };
-        vdb::write(&whole, &[result(&level_set)], None, &options).unwrap();
+        let report = vdb::write(&whole, &[result(&level_set)], None, &options).unwrap();
+        assert!(report.warnings.is_empty(), "{report:?}");
         assert_eq!(vdb::list(&whole).unwrap().grids[0].compression, compression);
-        let bytes = std::fs::read(&whole).unwrap();
-        let cut = folder.path().join("cut.vdb");
-        // Every length near both ends, and many between.
-        let lengths = (0..bytes.len()).filter(|n| *n < 700 || bytes.len() - n < 40 || n % 997 == 0);
-        for length in lengths {
-            std::fs::write(&cut, &bytes[..length]).unwrap();
-            let error = input_error(vdb::open(&cut));
-            assert!(error.contains("truncated") || error.contains("empty"), "{compression:?} {length}: {error}");
-            input_error(vdb::list(&cut));
-        }
-        let mut longer = bytes.clone();
-        longer.push(0);
-        std::fs::write(&cut, &longer).unwrap();
-        assert!(input_error(vdb::open(&cut)).contains("1 bytes follow"));
+        assert_cuts_are_errors(&std::fs::read(&whole).unwrap(), &format!("{compression:?}"));
     }
+}
+
+#[test]
+fn zip_is_for_other_grids_than_level_sets() {
+    let Some(path) = shared("velocity_vec3s.vdb") else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("zip.vdb");
+    let (file, level_set) = (vdb::open(path).unwrap(), sphere(Transform::uniform(0.1), 4.0));
+    let zip = WriteOptions { compression: Some(Compression::Zip), ..WriteOptions::default() };
+    let report = vdb::write(&out, &[result(&level_set)], Some(&file), &zip).unwrap();
+    assert!(report.warnings[0].contains("does not zip level sets"));
+    let back = vdb::open(&out).unwrap();
+    assert_eq!(back.listing().grids[0].compression, Compression::Zip);
+    assert_eq!(back.listing().grids[1].compression, Compression::None);
+    assert_eq!(back.fingerprint(0).unwrap(), file.fingerprint(0).unwrap());
+    assert_cuts_are_errors(&std::fs::read(&out).unwrap(), "zip");
+    // The next write keeps it for the grids that have it.
+    vdb::write(&out, &[], Some(&back), &WriteOptions::default()).unwrap();
+    assert_eq!(vdb::list(&out).unwrap().grids[0].compression, Compression::Zip);
 }
 
 #[test]
@@ -251,7 +273,7 @@ fn what_is_written_reads_back_bit_for_bit() {
     for affine in transforms {
         let transform = Transform::from_affine(affine).unwrap();
         // Larger than a node, so that there are inside tiles of both sizes.
-        let level_set = sphere(transform, 150.0);
+        let level_set = sphere(transform, 240.0);
         assert!(level_set.grid().inside_tiles().iter().any(|(_, edge)| *edge == 128));
         let report = vdb::write(&path, &[result(&level_set)], None, &WriteOptions::default()).unwrap();
         assert_eq!(report.bytes, std::fs::metadata(&path).unwrap().len());

@@ -21,7 +21,7 @@ pub struct MetaItem {
 pub enum Compression {
     /// Blosc with LZ4: OpenVDB's default.
     Blosc,
-    /// Deflate: smaller and much slower.
+    /// Deflate: smaller and much slower. OpenVDB leaves level sets and fog volumes uncompressed with it.
     Zip,
     /// None, except that uniform inactive values are not stored.
     None,
@@ -38,6 +38,12 @@ impl Compression {
             f if f & Self::ZIP != 0 => Self::Zip,
             _ => Self::None,
         }
+    }
+
+    /// That of a file: OpenVDB zips neither level sets nor fog volumes, so the grids of one file may differ.
+    pub(super) fn of_all(grids: &[GridListing]) -> Option<Self> {
+        let any = |wanted| grids.iter().any(|g| g.compression == wanted).then_some(wanted);
+        any(Self::Blosc).or_else(|| any(Self::Zip)).or_else(|| any(Self::None))
     }
 
     pub(super) fn flags(self) -> u32 {

@@ -36,12 +36,14 @@ pub struct GridToWrite<'a> {
 }
 
 /// What was written.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WriteReport {
     /// Size of the file.
     pub bytes: u64,
     /// Number of grids in it.
     pub grids: usize,
+    /// What is not as asked, and why.
+    pub warnings: Vec<String>,
 }
 
 /// Writes level sets, and with them the metadata and all other grids of `input`, to `path`; `-` is standard output.
@@ -56,14 +58,16 @@ pub fn write(
 ) -> Result<WriteReport> {
     let path = path.as_ref();
     let output = Target { path };
-    let compression = options
-        .compression
-        .or_else(|| input?.listing().grids.first().map(|g| g.compression))
-        .unwrap_or(Compression::Blosc)
-        .flags();
+    let compression = options.compression.or_else(|| Compression::of_all(&input?.listing().grids));
+    let compression = compression.unwrap_or(Compression::Blosc);
     let (mut content, count) = collect(grids, input, options).map_err(|e| output.error(e.what()))?;
-    let bytes = output.write(content.pin_mut(), compression)?;
-    Ok(WriteReport { bytes, grids: count })
+    let bytes = output.write(content.pin_mut(), compression.flags())?;
+    let mut warnings: Vec<_> =
+        ffi::take_log().map_err(|e| output.error(e.what()))?.lines().map(str::to_string).collect();
+    if compression == Compression::Zip && !grids.is_empty() {
+        warnings.push("OpenVDB does not zip level sets: they are stored uncompressed".into());
+    }
+    Ok(WriteReport { bytes, grids: count, warnings })
 }
 
 /// All grids of the file to be, in order.
