@@ -262,12 +262,15 @@ openvdb::math::Transform::Ptr linear_transform(rust::Slice<const double> m)
         for (int c = 0; c < 4; ++c) mat(r, c) = m[static_cast<std::size_t>(c * 4 + r)];
     }
     using openvdb::math::Transform;
-    const bool scale_only = mat(0, 0) == mat(1, 1) && mat(1, 1) == mat(2, 2) && mat(0, 0) > 0 && mat(0, 1) == 0 &&
-        mat(0, 2) == 0 && mat(1, 0) == 0 && mat(1, 2) == 0 && mat(2, 0) == 0 && mat(2, 1) == 0;
-    if (!scale_only) return Transform::createLinearTransform(mat);
-    // The uniform maps keep voxel size and translation exactly and are what other programs expect.
-    auto transform = Transform::createLinearTransform(mat(0, 0));
-    const openvdb::Vec3d translation(mat(3, 0), mat(3, 1), mat(3, 2));
+    const openvdb::Vec3d scale(mat(0, 0), mat(1, 1), mat(2, 2)), translation(mat(3, 0), mat(3, 1), mat(3, 2));
+    const bool axis_aligned = mat(0, 1) == 0 && mat(0, 2) == 0 && mat(1, 0) == 0 && mat(1, 2) == 0 && mat(2, 0) == 0 &&
+        mat(2, 1) == 0;
+    if (!axis_aligned) return Transform::createLinearTransform(mat);
+    // Step by step: from a matrix OpenVDB would compute the scale as a difference of positions, and lose digits of it where
+    // the translation is large. The uniform maps are what other programs expect.
+    const bool uniform = scale[0] == scale[1] && scale[1] == scale[2] && scale[0] > 0;
+    auto transform = Transform::createLinearTransform(uniform ? scale[0] : 1.0);
+    if (!uniform) transform->postScale(scale);
     if (translation != openvdb::Vec3d(0.0)) transform->postTranslate(translation);
     return transform;
 }

@@ -38,7 +38,7 @@ std::unique_ptr<FloatGrid> with_tree(const FloatGrid& like, const openvdb::Float
 {
     auto grid = make_float_grid(static_cast<double>(tree->background()));
     grid->insertMeta(*like.impl->grid);
-    grid->setTransform(like.impl->grid->constTransform().copy());
+    grid->setTransform(like.impl->grid->transformPtr());
     grid->setTree(tree);
     return wrap(std::move(grid));
 }

@@ -116,8 +116,12 @@ fn meshes_there_and_back() {
     for p in &mesh.points {
         assert!((f64::from(p.length()) - R * DX).abs() < 0.1 * DX);
     }
-    let triangles: Vec<[u32; 3]> =
-        mesh.quads.iter().flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]).chain(mesh.triangles.clone()).collect();
+    let triangles: Vec<[u32; 3]> = mesh
+        .quads
+        .iter()
+        .flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]])
+        .chain(mesh.triangles.clone())
+        .collect();
     let again = ReferenceGrid::from_mesh(&mesh.points, &triangles, Transform::uniform(DX), 3.0).unwrap();
     assert!((radius(&again) - R).abs() < 0.1);
     assert!(ReferenceGrid::from_mesh(&mesh.points, &[[0, 1, u32::MAX]], Transform::uniform(DX), 3.0).is_err());

@@ -187,7 +187,10 @@ pub fn diagnose_band(facts: &BandFacts, voxel_size: f64) -> Band {
     if facts.active_tiles > 0 {
         let Range { low, high } = facts.active_tile_values;
         if low.abs().min(high.abs()) < width || low * high < 0.0 {
-            return rebuild(format!("{} active tiles with values {low} to {high} hold no distances", facts.active_tiles));
+            return rebuild(format!(
+                "{} active tiles with values {low} to {high} hold no distances",
+                facts.active_tiles
+            ));
         }
     }
     if width < MIN_HALF_WIDTH_VOXELS * voxel_size {
@@ -210,7 +213,11 @@ pub fn diagnose_band(facts: &BandFacts, voxel_size: f64) -> Band {
 /// Width of one side from the farthest active distance and the distance that its inactive voxels hold: the latter, if the
 /// active ones come within a voxel of it.
 fn side(active: f64, inactive: f64, voxel_size: f64) -> f64 {
-    if active.is_finite() && active < inactive - voxel_size * (1.0 + WIDTH_TOLERANCE) { active.max(0.0) } else { inactive }
+    if active.is_finite() && active < inactive - voxel_size * (1.0 + WIDTH_TOLERANCE) {
+        active.max(0.0)
+    } else {
+        inactive
+    }
 }
 
 #[cfg(test)]
@@ -236,10 +243,7 @@ mod tests {
 
     #[test]
     fn unequal_widths_and_filled_interiors_are_trimmed() {
-        assert_eq!(
-            diagnose_band(&facts(0.3, (-0.49, 0.29), Some(-0.5)), 0.1),
-            Band::Trim { inner: 0.5, outer: 0.3 }
-        );
+        assert_eq!(diagnose_band(&facts(0.3, (-0.49, 0.29), Some(-0.5)), 0.1), Band::Trim { inner: 0.5, outer: 0.3 });
         assert_eq!(diagnose_band(&facts(0.3, (-7.0, 0.29), None), 0.1), Band::Trim { inner: 7.0, outer: 0.3 });
         // A background far from the band.
         let odd = diagnose_band(&facts(1e6, (-0.29, 0.28), Some(-0.3)), 0.1);

@@ -72,7 +72,8 @@ impl VdbFile {
     pub fn read_level_set(&self, selector: Option<&str>, assume_level_set: bool) -> Result<ReadLevelSet> {
         let index = self.select_level_set(selector, assume_level_set)?;
         let listing = &self.listing.grids[index];
-        let refuse = |reason: String| self.error(format!("grid `{}` cannot be a level set: {reason}", listing.selector));
+        let refuse =
+            |reason: String| self.error(format!("grid `{}` cannot be a level set: {reason}", listing.selector));
         let transform = listing.uniform_transform().map_err(refuse)?;
         let leaves = ffi::archive_leaves(&self.archive, index).map_err(|e| refuse(e.what().into()))?;
         let (grid, facts) = read_grid(&leaves, transform.voxel_size()).map_err(refuse)?;

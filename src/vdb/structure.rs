@@ -35,7 +35,9 @@ pub(super) fn check_start(start: &[u8], newest: u32) -> Result<(), String> {
             "not a VDB file but a Git LFS pointer: fetch the file itself with `git lfs pull`".into()
         }
         Some(text) if is_link_target(text) => {
-            format!("not a VDB file but the text `{text}`: a symbolic link checked out as a file; use the file it names")
+            format!(
+                "not a VDB file but the text `{text}`: a symbolic link checked out as a file; use the file it names"
+            )
         }
         _ => {
             let shown = &start[..start.len().min(8)];

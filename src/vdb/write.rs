@@ -180,7 +180,8 @@ impl Target<'_> {
         match std::fs::metadata(&real) {
             Ok(facts) if facts.is_dir() => Err(self.error("it is a directory")),
             Ok(facts) if !facts.is_file() => {
-                let device = std::fs::OpenOptions::new().write(true).open(&real).map_err(self.io("cannot be opened"))?;
+                let device =
+                    std::fs::OpenOptions::new().write(true).open(&real).map_err(self.io("cannot be opened"))?;
                 self.write_through(content, compression, device)
             }
             facts => self.replace(content, compression, &real, facts.ok()),
