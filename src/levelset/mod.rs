@@ -4,10 +4,20 @@
 //! ±background; background = half width · voxel size. `check` verifies these invariants.
 
 mod build;
+mod check;
+mod components;
+pub(crate) mod isosurface;
+pub(crate) mod marching;
+mod measure;
 mod sample;
+#[cfg(test)]
+pub(crate) mod testing;
+mod union_find;
 
 use glam::{DVec3, IVec3};
 
+pub use check::{Violation, ViolationKind};
+pub use measure::Measures;
 pub use sample::Sampler;
 
 use crate::grid::{Grid, Transform};

@@ -1,6 +1,10 @@
 //! Triangle meshes: files, and the way to a level set and back.
 
+mod from_levelset;
+
 use glam::DVec3;
+
+pub use from_levelset::level_set_to_mesh;
 
 /// An indexed triangle mesh in world units.
 ///
