@@ -5,10 +5,14 @@
 //! command line and recipes find operators in [`REGISTRY`] and know nothing of any one of them.
 
 pub mod csg;
+pub mod distance;
+pub mod morphology;
 mod params;
 mod registry;
+pub mod shape;
 pub mod smooth;
 mod solver;
+pub mod transform;
 
 pub use params::{Vector, VoxelLength, WorldLength};
 pub use registry::{Arity, Entry, Operator, Outcome, Parameter, REGISTRY, Summary, find};
