@@ -1,5 +1,5 @@
 // Whole files: reading with every short read an error, writing with every failed write an error, comparing.
-// Compiles in about 7 s at -O2.
+// Compiles in 4 s.
 //
 // OpenVDB's own File and Stream leave the stream's exceptions off: a truncated file that is not blosc-compressed then
 // loads without any error, its missing voxels zero, and a full disk goes unnoticed. So the streams are ours, with
