@@ -69,6 +69,11 @@ pub(super) fn count(grid: &Grid, surface: &IsoSurface) -> u64 {
     sets.count()
 }
 
+/// Bytes that [`count`] needs, where few leaves have more than one part.
+pub(super) fn bytes_needed(grid: &Grid) -> u64 {
+    (grid.leaves().len() * (size_of::<Parts>() + 3 * size_of::<u32>())) as u64
+}
+
 /// The connected parts of one leaf's inside: rarely more than one.
 type Parts = SmallVec<[LeafMask; 1]>;
 

@@ -71,6 +71,7 @@ impl LevelSet {
         measures.euler = loops - surface.vertex_count() as i64;
         measures.surface_components = surface_components(&surface);
         run.check(OPERATION)?;
+        run.reserve(OPERATION, components::bytes_needed(self.grid()), MEMORY_ADVICE)?;
         measures.components = components::count(self.grid(), &surface);
         Ok(measures)
     }

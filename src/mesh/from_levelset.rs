@@ -18,12 +18,13 @@ const OPERATION: &str = "level set to mesh";
 
 /// The surface φ = `iso` (world units, 0 for the level set's own) as a mesh in world units.
 ///
-/// |iso| must lie a voxel or more inside the band for an accurate surface, and below the background at all.
-/// Refused where the surface leaves the stored band: such a mesh would have holes.
+/// |iso| must be below the background, and a voxel below it for an accurate surface. Vertex attributes are not made.
+/// Refused where the surface leaves the stored band: such a mesh would have holes. Surfaces that lie between absent leaves
+/// altogether are not seen; [`LevelSet::check`] finds both.
 pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Result<TriangleMesh> {
     let grid = level_set.grid();
     let background = grid.background();
-    if !(iso.abs() < background) {
+    if iso.is_nan() || iso.abs() >= background {
         return Err(EditError::parameter(OPERATION, "iso", iso, format!("above -{background} and below {background}")));
     }
     let surface = IsoSurface::new(grid, iso, OPERATION, run)?;
@@ -74,12 +75,15 @@ fn leaves_the_band(place: String) -> EditError {
     }
 }
 
+/// A leaf, its vertices and its triangles.
+type Part<'a> = (&'a SurfaceLeaf, &'a mut [DVec3], &'a mut [[u32; 3]]);
+
 /// The part of both arrays that each leaf fills.
 fn split<'a>(
     leaves: &'a [SurfaceLeaf],
     mut positions: &'a mut [DVec3],
     mut triangles: &'a mut [[u32; 3]],
-) -> Vec<(&'a SurfaceLeaf, &'a mut [DVec3], &'a mut [[u32; 3]])> {
+) -> Vec<Part<'a>> {
     leaves
         .iter()
         .map(|leaf| {
