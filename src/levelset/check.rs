@@ -16,9 +16,9 @@ use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, neighbour_index, offse
 use crate::stencil::upwind::godunov_first;
 use crate::stencil::{Halo, Row};
 
-/// Part of all crossed edges, and a number besides, that may be flatter: where three or more surfaces of a CSG expression
-/// meet, single ones are.
-const FLAT_FRACTION: f64 = 0.01;
+/// Part of all crossed edges, and a number besides, that may be flatter on both sides: where three or more surfaces of a CSG
+/// expression meet, single ones are (measured: up to 1.4 % in random expressions of seven solids, none in exact fields).
+const FLAT_FRACTION: f64 = 0.05;
 const FLAT_ALWAYS: f64 = 8.0;
 
 impl LevelSet {
