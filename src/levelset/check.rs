@@ -226,17 +226,21 @@ impl LeafCheck<'_> {
         let inside = LeafMask(std::array::from_fn(|x| {
             values[x * 64..(x + 1) * 64].iter().enumerate().fold(0, |w, (b, v)| w | u64::from(*v < 0.0) << b)
         }));
-        if inside.is_empty() || inside == LeafMask::FULL {
+        let outside = LeafMask(inside.0.map(|w| !w));
+        let [crossed_inside, crossed_outside] =
+            [(inside, outside), (outside, inside)].map(|(side, other)| side.zip(other.dilated(), |a, b| a & b));
+        let crossed = crossed_inside.zip(crossed_outside, |a, b| a | b);
+        if crossed.is_empty() {
             return;
         }
         let mut squared = [[[0.0; 8]; 8]; 8];
         for (x, slice) in squared.iter_mut().enumerate() {
-            for (y, row) in slice.iter_mut().enumerate() {
+            for (y, row) in slice.iter_mut().enumerate().filter(|(y, _)| crossed.row(x, *y) != 0) {
                 *row = godunov_first(halo, x, y);
             }
         }
         let at = |p: IVec3| squared[p.x as usize][p.y as usize][p.z as usize];
-        for offset in inside.zip(mask, |s, a| s & a).iter() {
+        for offset in crossed_inside.zip(mask, |s, a| s & a).iter() {
             let voxel = offset_to_local(offset);
             for face in Face::ALL {
                 let beside = voxel + face.step();
