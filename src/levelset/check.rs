@@ -1,9 +1,10 @@
 //! Whether a level set is one: its invariants, verified voxel by voxel and pair by pair.
 //!
 //! A valid field passes: exact distances of any shape, sharp or thin, and plain min/max of valid fields, whose values
-//! are bounds of the distance but not distances. Such fields are 1-Lipschitz, and the |∇φ| of a bound may vanish on one side of the surface
-//! (on the seam between two united solids) but not on both. So steepness is judged between face neighbours everywhere, and flatness
-//! only across the surface, on the steeper side of each crossed grid edge, by Godunov's upwind |∇φ|.
+//! are bounds of the distance but not distances. Such fields are 1-Lipschitz, and the |∇φ| of a bound may vanish on
+//! one side of the surface (on the seam between two united solids) but not on both. So steepness is judged between
+//! face neighbours everywhere, and flatness only across the surface, on the steeper side of each crossed grid edge,
+//! by Godunov's upwind |∇φ|.
 //!
 //! One pass over the leaves, in parallel; counts and examples do not depend on the number of threads.
 
@@ -16,8 +17,9 @@ use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, neighbour_index, offse
 use crate::stencil::upwind::godunov_first;
 use crate::stencil::{Halo, Row};
 
-/// Part of all crossed edges, and a number besides, that may be flatter on both sides: where three or more surfaces of a CSG
-/// expression meet, single ones are (measured: up to 1.4 % in random expressions of seven solids, none in exact fields).
+/// Part of all crossed edges, and a number besides, that may be flatter on both sides: where three or more surfaces
+/// of a CSG expression meet, single ones are (measured: up to 1.4 % in random expressions of seven solids, none in
+/// exact fields).
 const FLAT_FRACTION: f64 = 0.05;
 const FLAT_ALWAYS: f64 = 8.0;
 
@@ -156,7 +158,8 @@ impl LeafCheck<'_> {
         }
     }
 
-    /// Checks the pairs across `face`: all of the leaf on an upper side, only those with the absent leaf on a lower side.
+    /// Checks the pairs across `face`: all of the leaf on an upper side, only those with the absent leaf on a lower
+    /// side.
     fn pairs(&mut self, halo: &Halo<10>, face: Face, beyond: LeafId) {
         let mask = self.grid.mask(self.id);
         let other = self.grid.mask(beyond);
@@ -218,8 +221,8 @@ impl LeafCheck<'_> {
         }
     }
 
-    /// Checks |∇φ| on the steeper side of each crossed edge within the leaf. Edges between leaves are left out: no leaf has
-    /// the gradient on both sides, and the inner ones are enough to judge the field.
+    /// Checks |∇φ| on the steeper side of each crossed edge within the leaf. Edges between leaves are left out: no
+    /// leaf has the gradient on both sides, and the inner ones are enough to judge the field.
     fn flatness(&mut self, halo: &Halo<10>) {
         let mask = self.grid.mask(self.id);
         let values = &self.grid.values(self.id).0;

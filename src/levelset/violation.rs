@@ -5,8 +5,8 @@ use std::fmt;
 use glam::IVec3;
 use serde::Serialize;
 
-/// Largest difference between face neighbours, in voxels. Exact fields reach 1, evolved ones a little more where a front
-/// sharpens; the limit is that of OpenVDB's own checker for |∇φ|.
+/// Largest difference between face neighbours, in voxels. Exact fields reach 1, evolved ones a little more where a
+/// front sharpens; the limit is that of OpenVDB's own checker for |∇φ|.
 pub(super) const STEEPEST: f32 = 1.5;
 
 /// Smallest |∇φ| at the surface: OpenVDB's limit.
@@ -79,16 +79,10 @@ impl fmt::Display for Violation {
             ViolationKind::HoleInBand => write!(f, "the surface leaves the band between {count} pairs of voxels")?,
             ViolationKind::SignMismatch => write!(f, "the space beside {count} voxels has the opposite sign")?,
             ViolationKind::TooSteep => {
-                write!(
-                    f,
-                    "{count} pairs of neighbours differ by more than {STEEPEST} voxels (up to {worst:.3}): not a distance"
-                )?;
+                write!(f, "{count} pairs of neighbours differ by over {STEEPEST} voxels (up to {worst:.3})")?;
             }
             ViolationKind::TooFlat => {
-                write!(
-                    f,
-                    "|grad phi| is below {FLATTEST} at {count} places of the surface (down to {worst:.3}): not a distance"
-                )?;
+                write!(f, "|grad phi| < {FLATTEST} at {count} places of the surface (down to {worst:.3})")?;
             }
             ViolationKind::BandTooNarrow => {
                 write!(f, "the band ends {worst:.3} voxels short of the background beside {count} voxels")?;
@@ -103,7 +97,7 @@ impl fmt::Display for Violation {
                 "--repair trims the band, `rebuild` makes it anew"
             }
             ViolationKind::TooSteep | ViolationKind::TooFlat => {
-                "`renormalize` restores small errors, `rebuild` or --repair any"
+                "not a distance: `renormalize` restores small errors, `rebuild` or --repair any"
             }
             ViolationKind::BandTooNarrow => "`rebuild` or --repair widens it",
         };
