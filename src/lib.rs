@@ -8,6 +8,7 @@ pub mod levelset;
 pub mod mesh;
 pub mod pde;
 pub mod region;
+pub mod render;
 pub mod run;
 pub mod stencil;
 
