@@ -13,7 +13,7 @@ use super::occlusion::Visibility;
 pub(super) const CLAY: DVec3 = DVec3::new(0.44, 0.355, 0.30);
 
 /// Radiance of the lights; their sum puts lit clay at the bright end of the tone curve, short of its shoulder.
-const KEY: DVec3 = DVec3::new(1.42, 1.34, 1.22);
+const KEY: DVec3 = DVec3::new(1.34, 1.265, 1.15);
 const HEADLIGHT: DVec3 = DVec3::new(0.09, 0.095, 0.10);
 const RIM: DVec3 = DVec3::new(0.75, 0.85, 1.0);
 const SKY_ABOVE: DVec3 = DVec3::new(0.46, 0.51, 0.58);
@@ -50,6 +50,13 @@ pub(super) fn clay(lights: &Lights, albedo: DVec3, normal: DVec3, view: DVec3, s
     diffuse + sheen + rim
 }
 
+/// What sculptors rub into and off a cast: a factor that darkens creases and lightens ridges by their mean curvature
+/// (1/voxel), so that both can be seen in full light as well. Half of its effect is reached at a radius of about 6 voxels.
+pub(super) fn patina(mean_curvature: f64) -> f64 {
+    let strength = (3.0 * mean_curvature.abs()).tanh();
+    if mean_curvature < 0.0 { 1.0 - 0.42 * strength } else { 1.0 + 0.14 * strength }
+}
+
 /// Light on a surface whose colour says something: bright and even, so that the colour can be read off a legend.
 pub(super) fn data(lights: &Lights, albedo: DVec3, normal: DVec3, view: DVec3, seen: Visibility) -> DVec3 {
     let key = 0.34 * normal.dot(lights.key).max(0.0) * seen.key;
@@ -69,7 +76,7 @@ fn bounced(seen: f64, albedo: DVec3) -> DVec3 {
 /// Filmic tone curve, 0..∞ to 0..1 (Narkowicz's fit of ACES): soft shoulder, slight toe.
 pub(super) fn filmic(x: DVec3) -> DVec3 {
     let curve = |x: f64| (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14);
-    x.map(|c| curve(0.98 * c.max(0.0)).min(1.0))
+    x.map(|c| curve(0.86 * c.max(0.0)).min(1.0))
 }
 
 /// Linear from 8-bit sRGB.

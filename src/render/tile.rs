@@ -149,7 +149,7 @@ impl Picture<'_> {
         let world_normal = self.transform.direction_to_world(normal);
         let xyz = || self.transform.index_to_world(position);
         let albedo = match self.color_by {
-            ColorBy::Clay => shade::CLAY,
+            ColorBy::Clay => shade::CLAY * shade::patina(jet.mean_curvature()),
             ColorBy::Normal => world_normal * 0.5 + 0.5,
             ColorBy::Curvature => shade::diverging(jet.mean_curvature() / self.range.0),
             ColorBy::Difference(_) => readers.other.as_mut().map_or(shade::CLAY, |(sampler, transform, voxel)| {
