@@ -128,44 +128,40 @@ impl Cursor<'_> {
         // Sums over z, then y, then x; the index is the order of the derivative along that axis.
         let mut gradient = DVec3::ZERO;
         let (mut diagonal, mut mixed) = (DVec3::ZERO, DVec3::ZERO);
-        for i in 0..4 {
+        for (i, x) in (0..).zip(wx) {
             let mut plane = [[0.0; 3]; 3];
-            for j in 0..4 {
+            for (j, y) in (0..).zip(wy) {
                 let mut row = [0.0; 3];
-                for k in 0..4 {
-                    let tap = first + IVec3::new(i as i32, j as i32, k as i32);
-                    let value = f64::from(self.tap(tap));
-                    for (sum, w) in row.iter_mut().zip(&wz) {
-                        *sum += w[k] * value;
+                for (k, z) in (0..).zip(wz) {
+                    let value = f64::from(self.tap(first + IVec3::new(i, j, k)));
+                    for (sum, w) in row.iter_mut().zip(z) {
+                        *sum += w * value;
                     }
                 }
-                for (sums, w) in plane.iter_mut().zip(&wy) {
+                for (sums, w) in plane.iter_mut().zip(y) {
                     for (sum, r) in sums.iter_mut().zip(row) {
-                        *sum += w[j] * r;
+                        *sum += w * r;
                     }
                 }
             }
-            gradient += DVec3::new(wx[1][i] * plane[0][0], wx[0][i] * plane[1][0], wx[0][i] * plane[0][1]);
-            diagonal += DVec3::new(wx[2][i] * plane[0][0], wx[0][i] * plane[2][0], wx[0][i] * plane[0][2]);
-            mixed += DVec3::new(wx[0][i] * plane[1][1], wx[1][i] * plane[0][1], wx[1][i] * plane[1][0]);
+            gradient += DVec3::new(x[1] * plane[0][0], x[0] * plane[1][0], x[0] * plane[0][1]);
+            diagonal += DVec3::new(x[2] * plane[0][0], x[0] * plane[2][0], x[0] * plane[0][2]);
+            mixed += DVec3::new(x[0] * plane[1][1], x[1] * plane[0][1], x[1] * plane[1][0]);
         }
         let s = self.field.to_voxels;
         Jet { gradient: gradient * s, diagonal: diagonal * s, mixed: mixed * s }
     }
 }
 
-/// Weights of the uniform cubic B-spline at `t` in 0..1 of the middle interval, and of its first and second derivative.
-fn spline_weights(t: f64) -> [[f64; 4]; 3] {
+/// Weights of the four taps of the uniform cubic B-spline at `t` in 0..1 of its middle interval, each with its first and
+/// second derivative.
+fn spline_weights(t: f64) -> [[f64; 3]; 4] {
     let u = 1.0 - t;
     [
-        [
-            u * u * u / 6.0,
-            (3.0 * t * t * t - 6.0 * t * t + 4.0) / 6.0,
-            (3.0 * u * u * u - 6.0 * u * u + 4.0) / 6.0,
-            t * t * t / 6.0,
-        ],
-        [-0.5 * u * u, 1.5 * t * t - 2.0 * t, 2.0 * u - 1.5 * u * u, 0.5 * t * t],
-        [u, 3.0 * t - 2.0, 3.0 * u - 2.0, t],
+        [u * u * u / 6.0, -0.5 * u * u, u],
+        [(3.0 * t * t * t - 6.0 * t * t + 4.0) / 6.0, 1.5 * t * t - 2.0 * t, 3.0 * t - 2.0],
+        [(3.0 * u * u * u - 6.0 * u * u + 4.0) / 6.0, 2.0 * u - 1.5 * u * u, 3.0 * u - 2.0],
+        [t * t * t / 6.0, 0.5 * t * t, t],
     ]
 }
 

@@ -79,12 +79,14 @@ pub(super) fn filmic(x: DVec3) -> DVec3 {
     x.map(|c| curve(0.86 * c.max(0.0)).min(1.0))
 }
 
+/// Linear from sRGB 0..1.
+pub(super) fn to_linear(srgb: DVec3) -> DVec3 {
+    srgb.map(|c| if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) })
+}
+
 /// Linear from 8-bit sRGB.
-pub(super) fn decode([r, g, b]: [u8; 3]) -> DVec3 {
-    DVec3::new(f64::from(r), f64::from(g), f64::from(b)).map(|c| {
-        let c = c / 255.0;
-        if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
-    })
+pub(super) fn decode(srgb: [u8; 3]) -> DVec3 {
+    to_linear(DVec3::from_array(srgb.map(f64::from)) / 255.0)
 }
 
 /// 8-bit sRGB from linear 0..1. `dither` (0..1) decides which of the two nearest values is taken: smooth gradients keep

@@ -122,6 +122,38 @@ fn turning_the_object_equals_turning_the_camera() {
 }
 
 #[test]
+fn a_framed_sphere_keeps_its_size_from_everywhere() {
+    let set = bars(Transform::uniform(0.5));
+    let mut options = plain(80, 60);
+    options.camera.frame = Frame::Sphere;
+    let centre_of = |options: &RenderOptions| {
+        let points = points_to_frame(&set, options.camera.frame);
+        let camera = Camera::framing(&options.camera, &points, 80, 60);
+        (points[0].0, (camera.eye - points[0].0).length())
+    };
+    let (centre, distance) = centre_of(&options);
+    for azimuth in [0.0, 90.0, 123.0] {
+        options.camera.azimuth = azimuth;
+        let (c, d) = centre_of(&options);
+        assert!((c - centre).length() < 1e-9 && (d - distance).abs() < 1e-9);
+        let image = picture(&set, &ColorBy::Clay, &options);
+        let border = (0..80).flat_map(|x| [(x, 0), (x, 59)]).chain((0..60).flat_map(|y| [(0, y), (79, y)]));
+        assert!(border.into_iter().all(|(x, y)| image.pixel(x, y).unwrap()[3] == 0));
+        assert!(coverage(&image) > 400.0);
+    }
+}
+
+#[test]
+fn the_narrowest_band_has_no_holes() {
+    // Where leaves end one voxel from the surface, cells with surface begin in absent leaves.
+    let set = sphere(24.0, 1.0);
+    let image = picture(&set, &ColorBy::Clay, &plain(101, 101));
+    let inside = (0..101).flat_map(|y| (0..101).map(move |x| (x, y)));
+    let inside = inside.filter(|(x, y)| (*x as f64 - 50.0).hypot(*y as f64 - 50.0) < 40.0);
+    assert!(inside.into_iter().all(|(x, y)| image.pixel(x, y).unwrap()[3] == 255));
+}
+
+#[test]
 fn the_world_is_not_mirrored() {
     // A small ball at +x and one at +y on the big one: right and above in a front view.
     let set = shape(Transform::uniform(0.5), 3.0, 30, |p| {
@@ -241,7 +273,8 @@ fn odd_sizes_work_and_bad_options_are_refused() {
         let image = picture(&ball, &ColorBy::Clay, &RenderOptions { width, height, ..RenderOptions::default() });
         assert_eq!(image.rgba8.len() as u32, width * height * 4);
     }
-    let refused: [(&str, fn(&mut RenderOptions)); 9] = [
+    type Change = fn(&mut RenderOptions);
+    let refused: [(&str, Change); 9] = [
         ("width", |o| o.width = 0),
         ("height", |o| o.height = 16385),
         ("antialias", |o| o.antialias = 0),
