@@ -44,19 +44,15 @@ pub struct SolverOptions {
     pub weno_epsilon: WenoEpsilon,
 }
 
-impl Default for SolverOptions {
-    /// First-order differences, one Euler step: what curvature flows need (measured in the tests of [`evolve`]).
-    fn default() -> Self {
-        Self {
-            scheme: UpwindScheme::First,
-            integrator: TimeIntegrator::TvdRk1,
-            normalizations: 1,
-            weno_epsilon: WenoEpsilon::SCALE_FREE,
-        }
-    }
-}
-
 impl SolverOptions {
+    /// The cheapest: first-order differences, one Euler step.
+    pub const FIRST_ORDER: Self = Self {
+        scheme: UpwindScheme::First,
+        integrator: TimeIntegrator::TvdRk1,
+        normalizations: 1,
+        weno_epsilon: WenoEpsilon::SCALE_FREE,
+    };
+
     /// What OpenVDB's `LevelSetFilter` uses: HJ-WENO5, Euler, three normalisations, its ε.
     pub const OPENVDB: Self = Self {
         scheme: UpwindScheme::HjWeno5,

@@ -4,11 +4,13 @@
 //! feathered by default, so that the result stays a distance at the region's rim.
 
 mod primitive;
+mod spec;
 mod weights;
 
 use glam::DVec3;
 
 pub use primitive::{Primitive, Shape};
+pub use spec::parse_regions;
 pub use weights::RegionWeights;
 
 /// A weight in space.

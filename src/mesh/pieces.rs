@@ -1,0 +1,249 @@
+//! The pieces of a surface that separate an inside from an outside.
+//!
+//! Where parts of a mesh overlap, some of its area lies inside of the union and must not attract the distance; where it is
+//! a sheet, both sides are outside. A piece counts if the winding number is above ½ on one of its sides and not on the other.
+//!
+//! Along a triangle that no other one touches the winding number changes only because of the mesh's boundary, and no
+//! faster than [`Rim`] says: such a triangle is judged by one point. Others are cut into pieces of at most
+//! [`COARSE`] voxels, and where pieces that count lie beside pieces that do not, further down to [`FINE`].
+
+use glam::{DVec3, I64Vec3};
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use super::inside::{Rim, WINDING_ERROR};
+use super::intersect::intersecting;
+use super::winding::BATCH;
+use super::{Bvh, WindingNumber};
+
+/// Longest edge, in voxels, of the pieces that are judged first.
+const COARSE: f64 = 2.0;
+/// Longest edge, in voxels, of the pieces along the border between what counts and what does not.
+const FINE: f64 = 0.25;
+/// How far, in voxels, beside a piece its sides are judged: beyond the rounding of coincident triangles, well below the
+/// distance of two walls that a grid could tell apart.
+const BESIDE: f64 = 1e-3;
+
+/// What remains of a surface.
+pub(crate) struct Pieces {
+    /// The pieces that count.
+    pub kept: Vec<[DVec3; 3]>,
+    /// Fraction of the area that does not.
+    pub removed_area_fraction: f64,
+}
+
+/// Cuts and judges the triangles of an indexed mesh in index space.
+pub(crate) fn separating_pieces(
+    positions: &[DVec3],
+    triangles: &[[u32; 3]],
+    bvh: &Bvh,
+    winding: &WindingNumber<'_>,
+    rim: &Rim,
+) -> Pieces {
+    let crossed = intersecting(bvh, positions, triangles);
+    let corners = |t: u32| triangles[t as usize].map(|v| positions[v as usize]);
+    let total: f64 = (0..triangles.len() as u32).map(|t| area(&corners(t))).sum();
+    let mut removed = 0.0;
+    let mut kept = Vec::new();
+    let mut open = Vec::new();
+    // In the order of the tree, so that those judged together lie together.
+    let (mut whole, others): (Vec<u32>, Vec<u32>) = bvh.order().iter().partition(|&&t| !crossed[t as usize]);
+    let verdicts: Vec<Option<bool>> = whole
+        .par_chunks(BATCH)
+        .flat_map_iter(|chunk| {
+            let fronts = by_batch(chunk, |&t| beside(&corners(t), 1.0), winding);
+            chunk.iter().zip(fronts).map(|(&t, front)| verdict_by_one_point(corners(t), front, rim)).collect::<Vec<_>>()
+        })
+        .collect();
+    let mut verdicts = verdicts.into_iter();
+    whole.retain(|&t| match verdicts.next().flatten() {
+        Some(true) => {
+            kept.push(corners(t));
+            false
+        }
+        Some(false) => {
+            removed += area(&corners(t));
+            false
+        }
+        None => true,
+    });
+    let mut size = COARSE;
+    open.extend(whole.par_iter().chain(&others).flat_map_iter(|&t| cut(corners(t), size)).collect::<Vec<_>>());
+    while !open.is_empty() {
+        let counts: Vec<bool> = open
+            .par_chunks(BATCH)
+            .flat_map_iter(|chunk| {
+                let fronts = by_batch(chunk, |piece| beside(piece, 1.0), winding);
+                let backs = by_batch(chunk, |piece| beside(piece, -1.0), winding);
+                fronts.into_iter().zip(backs).map(|(front, back)| (front > 0.5) != (back > 0.5)).collect::<Vec<_>>()
+            })
+            .collect();
+        let border = if size > FINE { borders(&open, &counts, size) } else { vec![false; open.len()] };
+        let mut next = Vec::new();
+        for ((piece, counts), border) in open.into_iter().zip(counts).zip(border) {
+            match (border, counts) {
+                (true, _) => next.extend(cut(piece, size / 2.0)),
+                (false, true) => kept.push(piece),
+                (false, false) => removed += area(&piece),
+            }
+        }
+        open = next;
+        size /= 2.0;
+    }
+    Pieces { kept, removed_area_fraction: if total > 0.0 { removed / total } else { 0.0 } }
+}
+
+/// Whether a triangle that no other one touches counts, from the winding number in front of its centre; behind it is one
+/// more. `None` if that might differ elsewhere on the triangle.
+fn verdict_by_one_point(corners: [DVec3; 3], front: f64, rim: &Rim) -> Option<bool> {
+    let center = (corners[0] + corners[1] + corners[2]) / 3.0;
+    let radius = corners.iter().map(|c| c.distance(center)).fold(0.0, f64::max);
+    let slope = rim.steepest(center, radius, 0.5 / radius.max(f64::MIN_POSITIVE))?;
+    let margin = WINDING_ERROR + slope * radius;
+    // Changes at front = −½ and ½.
+    ((front.abs() - 0.5).abs() > margin).then_some(front.abs() < 0.5)
+}
+
+/// A point just beside a piece, in front of it or behind it.
+fn beside(piece: &[DVec3; 3], side: f64) -> DVec3 {
+    let [a, b, c] = piece;
+    (a + b + c) / 3.0 + (b - a).cross(c - a).normalize_or_zero() * (side * BESIDE)
+}
+
+/// Winding numbers at a point each of up to [`BATCH`] things.
+fn by_batch<T>(things: &[T], point: impl Fn(&T) -> DVec3, winding: &WindingNumber<'_>) -> Vec<f64> {
+    let Some(last) = things.last() else { return Vec::new() };
+    let points = std::array::from_fn(|i| point(things.get(i).unwrap_or(last)));
+    winding.at_each::<BATCH>(&points)[..things.len().min(BATCH)].to_vec()
+}
+
+/// Which pieces lie beside a piece of the other kind.
+fn borders(pieces: &[[DVec3; 3]], counts: &[bool], size: f64) -> Vec<bool> {
+    // Centroids of pieces that touch are within 4/3 of the longest edge: in this cell or the next.
+    let edge = size * 4.0 / 3.0;
+    let center = |piece: &[DVec3; 3]| (piece[0] + piece[1] + piece[2]) / 3.0;
+    let cell = |p: DVec3| (p / edge).floor().as_i64vec3();
+    let mut cells: FxHashMap<I64Vec3, [Vec<DVec3>; 2]> = FxHashMap::default();
+    let differ = counts.iter().any(|&c| c) && counts.iter().any(|&c| !c);
+    if !differ {
+        return vec![false; pieces.len()];
+    }
+    for (piece, &counts) in pieces.iter().zip(counts) {
+        let center = center(piece);
+        cells.entry(cell(center)).or_default()[usize::from(counts)].push(center);
+    }
+    pieces
+        .par_iter()
+        .zip(counts)
+        .map(|(piece, &counts)| {
+            let center = center(piece);
+            let middle = cell(center);
+            (0..27).any(|i| {
+                let neighbour = middle + I64Vec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1);
+                let others = cells.get(&neighbour).map_or(&[][..], |c| &c[usize::from(!counts)]);
+                others.iter().any(|other| other.distance_squared(center) <= edge * edge)
+            })
+        })
+        .collect()
+}
+
+fn area([a, b, c]: &[DVec3; 3]) -> f64 {
+    0.5 * (b - a).cross(c - a).length()
+}
+
+/// Cuts a triangle into pieces whose edges are not longer than `size`: in halves across the longest edge, and what is
+/// narrow by then into slices, because halving a needle makes ever more needles.
+fn cut(triangle: [DVec3; 3], size: f64) -> Vec<[DVec3; 3]> {
+    let mut done = Vec::new();
+    let mut open = vec![triangle];
+    while let Some([a, b, c]) = open.pop() {
+        let lengths = [a.distance(b), b.distance(c), c.distance(a)];
+        let longest = (0..3).fold(0, |best, k| if lengths[k] > lengths[best] { k } else { best });
+        let length = lengths[longest];
+        if length <= size {
+            done.push([a, b, c]);
+            continue;
+        }
+        let [from, to, apex] = [[a, b, c], [b, c, a], [c, a, b]][longest];
+        if 2.0 * area(&[a, b, c]) <= 0.5 * size * length {
+            slice([from, to, apex], size, &mut done);
+            continue;
+        }
+        let middle = (from + to) * 0.5;
+        open.push([middle, to, apex]);
+        open.push([from, middle, apex]);
+    }
+    done
+}
+
+/// Slices a triangle whose first edge is its longest and whose height is at most half of `size` across that edge.
+fn slice([from, to, apex]: [DVec3; 3], size: f64, done: &mut Vec<[DVec3; 3]>) {
+    let base = to - from;
+    let length = base.length();
+    let at_apex = ((apex - from).dot(base) / (length * length)).clamp(0.0, 1.0);
+    // With the height, the diagonal of a slice of 0.8 by 0.5 is below one size.
+    let steps = (length / (0.8 * size)).ceil();
+    let mut cuts: Vec<f64> = (0..=steps as usize).map(|i| i as f64 / steps).chain([at_apex]).collect();
+    cuts.sort_unstable_by(f64::total_cmp);
+    cuts.dedup();
+    let roof = |t: f64| {
+        if t <= at_apex && at_apex > 0.0 {
+            from.lerp(apex, t / at_apex)
+        } else {
+            to.lerp(apex, (1.0 - t) / (1.0 - at_apex))
+        }
+    };
+    for pair in cuts.windows(2) {
+        let (floor0, floor1) = (from.lerp(to, pair[0]), from.lerp(to, pair[1]));
+        let (roof0, roof1) = (roof(pair[0]), roof(pair[1]));
+        let corners = [[floor0, floor1, roof1], [floor0, roof1, roof0]];
+        done.extend(corners.into_iter().filter(|t| area(t) > 0.0));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::TriangleMesh;
+    use crate::mesh::testing::*;
+
+    fn pieces(mesh: &TriangleMesh) -> Pieces {
+        let bvh = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect());
+        let rim = Rim::new(&mesh.positions, &mesh.triangles);
+        separating_pieces(&mesh.positions, &mesh.triangles, &bvh, &WindingNumber::new(&bvh), &rim)
+    }
+
+    #[test]
+    fn all_of_a_cube_counts_and_nothing_of_a_sheet() {
+        let cube = cube(DVec3::ZERO, 10.0);
+        assert_eq!(pieces(&cube).removed_area_fraction, 0.0);
+        let sheet = TriangleMesh { triangles: cube.triangles[..2].to_vec(), ..cube };
+        let sheet = pieces(&sheet);
+        assert!(sheet.kept.is_empty() && (sheet.removed_area_fraction - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn only_the_outer_walls_of_two_cubes_count() {
+        // Two cubes of edge 8 that overlap in a cube of edge 4: of 768, three faces of 4x4 of each are inside.
+        let both = pieces(&joined(cube(DVec3::splat(0.1), 8.0), &cube(DVec3::splat(4.1), 8.0)));
+        assert!((both.removed_area_fraction - 96.0 / 768.0).abs() < 0.01, "{}", both.removed_area_fraction);
+        let overlap = |p: DVec3| p.cmpgt(DVec3::splat(4.1 + 0.25)).all() && p.cmplt(DVec3::splat(8.1 - 0.25)).all();
+        assert!(!both.kept.iter().flatten().any(|&p| overlap(p)));
+    }
+
+    #[test]
+    fn cutting_keeps_the_area_and_bounds_the_edges() {
+        for triangle in [
+            [DVec3::ZERO, DVec3::X * 9.0, DVec3::Y * 5.0],
+            [DVec3::ZERO, DVec3::X * 300.0, DVec3::new(150.0, 0.01, 0.0)],
+        ] {
+            let pieces = cut(triangle, 1.0);
+            assert!((pieces.iter().map(area).sum::<f64>() - area(&triangle)).abs() < 1e-9);
+            assert!(
+                pieces.iter().all(|[a, b, c]| a.distance(*b).max(b.distance(*c)).max(c.distance(*a)) <= 1.0 + 1e-12)
+            );
+            // In proportion to the length, not to its square.
+            assert!(pieces.len() < 1000, "{}", pieces.len());
+        }
+    }
+}
