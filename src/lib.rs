@@ -13,6 +13,8 @@ pub mod region;
 pub mod run;
 pub mod spec;
 pub mod stencil;
+#[cfg(feature = "openvdb")]
+pub mod vdb;
 
 pub use error::{EditError, Result};
 pub use levelset::LevelSet;
