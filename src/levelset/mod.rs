@@ -8,6 +8,7 @@ mod sample;
 
 use glam::{DVec3, IVec3};
 
+pub(crate) use build::grid_of_leaves;
 pub use sample::Sampler;
 
 use crate::grid::{Grid, Transform};

@@ -1,0 +1,262 @@
+//! Closing what the triangles leave open.
+//!
+//! The sign of a voxel is known from the winding number. Where two neighbouring voxels differ and no triangle passes between them, the
+//! ½ level of the winding number does: there the surface is closed by the quads of a dual grid, one across each such
+//! pair, with a vertex in each of the four cells around it at the mean of the places where the surface crosses the
+//! cell's edges. A quad has a vertex in each quadrant around its pair, so it does pass between the two voxels: afterwards their
+//! distances to the surface add up to no more than one voxel, and the sign never changes outside the band.
+//! Leaves are added around the quads until no open pair is left; the ½ level is bounded, so that this ends.
+
+use glam::{DVec3, IVec3};
+use rayon::prelude::*;
+use rustc_hash::{FxHashMap, FxHashSet};
+
+use super::WindingNumber;
+use super::inside::{APART, Inside};
+use super::scatter::UnsignedLeaf;
+use crate::error::Result;
+use crate::grid::{LEAF_DIM, LeafMask, LeafValues, leaf_offset, leaf_origin};
+use crate::run::RunOptions;
+
+const AXES: [IVec3; 3] = [IVec3::X, IVec3::Y, IVec3::Z];
+
+/// Leaves of distances, found by origin.
+#[derive(Default)]
+pub(crate) struct DistanceLeaves {
+    leaves: Vec<UnsignedLeaf>,
+    index: FxHashMap<IVec3, usize>,
+}
+
+impl DistanceLeaves {
+    pub fn new(leaves: Vec<UnsignedLeaf>) -> Self {
+        let index = leaves.iter().enumerate().map(|(i, leaf)| (leaf.origin, i)).collect();
+        Self { leaves, index }
+    }
+
+    pub fn find(&self, origin: IVec3) -> Option<&LeafValues> {
+        self.index.get(&origin).map(|&i| &self.leaves[i].distance)
+    }
+
+    pub fn origins(&self) -> impl Iterator<Item = IVec3> + '_ {
+        self.leaves.iter().map(|leaf| leaf.origin)
+    }
+
+    pub fn leaves(&self) -> &[UnsignedLeaf] {
+        &self.leaves
+    }
+
+    pub fn into_leaves(self) -> Vec<UnsignedLeaf> {
+        self.leaves
+    }
+
+    /// Lowers the distances to those of `other`.
+    pub fn merge(&mut self, other: Vec<UnsignedLeaf>) {
+        for leaf in other {
+            match self.index.get(&leaf.origin) {
+                Some(&i) => {
+                    let values = &mut self.leaves[i].distance.0;
+                    values.iter_mut().zip(&leaf.distance.0).for_each(|(a, b)| *a = a.min(*b));
+                }
+                None => {
+                    self.index.insert(leaf.origin, self.leaves.len());
+                    self.leaves.push(leaf);
+                }
+            }
+        }
+    }
+}
+
+/// The signs of a surface's surroundings, extended as far as they are asked for.
+pub(crate) struct Surroundings<'a> {
+    inside: &'a Inside<'a>,
+    winding: &'a WindingNumber<'a>,
+    /// Distances to all triangles of the mesh.
+    all: &'a DistanceLeaves,
+    masks: FxHashMap<IVec3, LeafMask>,
+}
+
+impl<'a> Surroundings<'a> {
+    pub fn new(inside: &'a Inside<'a>, winding: &'a WindingNumber<'a>, all: &'a DistanceLeaves) -> Self {
+        Self { inside, winding, all, masks: FxHashMap::default() }
+    }
+
+    /// The inside of the leaf at `origin`, if it is known.
+    pub fn mask(&self, origin: IVec3) -> Option<&LeafMask> {
+        self.masks.get(&origin)
+    }
+
+    /// Finds the signs of the leaves at `origins`.
+    pub fn extend(&mut self, origins: &[IVec3]) {
+        let masks: Vec<_> =
+            origins.par_iter().map(|&origin| (origin, self.inside.leaf(origin, self.all.find(origin)))).collect();
+        self.masks.extend(masks);
+    }
+
+    fn is_inside(&self, ijk: IVec3) -> bool {
+        self.masks.get(&leaf_origin(ijk)).is_some_and(|m| m.get(leaf_offset(ijk)))
+    }
+
+    /// The triangles that close the surface whose distances are `kept`, with the signs of everything around them.
+    pub fn close(&mut self, kept: &DistanceLeaves, half_width: f32, run: &RunOptions) -> Result<Vec<[DVec3; 3]>> {
+        let mut fresh: Vec<IVec3> = self.all.origins().chain(kept.origins()).collect();
+        let mut edges: Vec<OpenEdge> = Vec::new();
+        while !fresh.is_empty() {
+            run.check("mesh to level set")?;
+            let bytes = (self.masks.len() + fresh.len()) as u64 * 4 * 2048;
+            run.reserve(
+                "mesh to level set",
+                bytes,
+                "the mesh is open and closes far from its triangles; take a larger voxel_size",
+            )?;
+            fresh.sort_unstable_by_key(IVec3::to_array);
+            fresh.dedup();
+            self.extend(&fresh);
+            // A pair is listed with its lower voxel, so the leaves below new ones are looked at again.
+            let below = |o: &IVec3| AXES.map(|axis| *o - axis * LEAF_DIM);
+            let mut dirty: Vec<IVec3> = fresh.iter().flat_map(below).filter(|o| self.masks.contains_key(o)).collect();
+            dirty.extend(&fresh);
+            dirty.sort_unstable_by_key(IVec3::to_array);
+            dirty.dedup();
+            let found: Vec<OpenEdge> =
+                dirty.par_iter().flat_map_iter(|&origin| self.open_edges(origin, kept, half_width)).collect();
+            let mut missing: FxHashSet<IVec3> = FxHashSet::default();
+            for edge in &found {
+                for corner in 0..8 {
+                    let side = IVec3::new(corner & 1, corner >> 1 & 1, corner >> 2 & 1);
+                    let ijk = IVec3::from_array(edge.ijk) - 1 + side * (AXES[edge.axis] + 2);
+                    missing.insert(leaf_origin(ijk));
+                }
+            }
+            edges.extend(found);
+            fresh = missing.into_iter().filter(|o| !self.masks.contains_key(o)).collect();
+        }
+        edges.sort_unstable();
+        edges.dedup();
+        Ok(self.quads(&edges, kept, half_width))
+    }
+
+    /// The pairs of a voxel of the leaf at `origin` and its upper neighbours that differ with no surface between.
+    fn open_edges(&self, origin: IVec3, kept: &DistanceLeaves, half_width: f32) -> Vec<OpenEdge> {
+        let mut edges = Vec::new();
+        let Some(mask) = self.masks.get(&origin) else { return edges };
+        let own = kept.find(origin);
+        for (axis, step) in AXES.into_iter().enumerate() {
+            let neighbour = origin + step * LEAF_DIM;
+            let beyond = kept.find(neighbour);
+            for offset in differing(mask, self.masks.get(&neighbour), axis).iter() {
+                let ijk = origin + crate::grid::offset_to_local(offset);
+                let next = ijk + step;
+                let next_leaf = if leaf_origin(next) == origin { own } else { beyond };
+                let distance = |leaf: Option<&LeafValues>, o: usize| leaf.map_or(half_width, |l| l.0[o]);
+                if distance(own, offset) + distance(next_leaf, leaf_offset(next)) > APART {
+                    edges.push(OpenEdge { ijk: ijk.to_array(), axis });
+                }
+            }
+        }
+        edges
+    }
+
+    /// The quads across open edges, as triangles.
+    fn quads(&self, edges: &[OpenEdge], kept: &DistanceLeaves, half_width: f32) -> Vec<[DVec3; 3]> {
+        let crossing: FxHashMap<OpenEdge, f64> = edges.par_iter().map(|&edge| (edge, self.half_level(edge))).collect();
+        let distance = |ijk: IVec3| kept.find(leaf_origin(ijk)).map_or(half_width, |l| l.0[leaf_offset(ijk)]) as f64;
+        let vertex = |cell: IVec3| {
+            let mut sum = DVec3::ZERO;
+            let mut count = 0.0;
+            for (axis, step) in AXES.into_iter().enumerate() {
+                let (u, v) = (AXES[(axis + 1) % 3], AXES[(axis + 2) % 3]);
+                for ijk in [cell, cell + u, cell + v, cell + u + v] {
+                    if self.is_inside(ijk) == self.is_inside(ijk + step) {
+                        continue;
+                    }
+                    let t = crossing.get(&OpenEdge { ijk: ijk.to_array(), axis }).copied().unwrap_or_else(|| {
+                        let (a, b) = (distance(ijk), distance(ijk + step));
+                        if a + b > 0.0 { a / (a + b) } else { 0.5 }
+                    });
+                    sum += ijk.as_dvec3() + step.as_dvec3() * t;
+                    count += 1.0;
+                }
+            }
+            // An open edge of the cell is always among them.
+            sum / f64::max(count, 1.0)
+        };
+        edges
+            .par_iter()
+            .flat_map_iter(|edge| {
+                let ijk = IVec3::from_array(edge.ijk);
+                let (u, v) = (AXES[(edge.axis + 1) % 3], AXES[(edge.axis + 2) % 3]);
+                let [a, b, c, d] = [ijk - u - v, ijk - v, ijk, ijk - u].map(vertex);
+                [[a, b, c], [a, c, d]]
+            })
+            .collect()
+    }
+
+    /// Where along an open edge the winding number is ½.
+    fn half_level(&self, edge: OpenEdge) -> f64 {
+        let ijk = IVec3::from_array(edge.ijk);
+        let [a, b] = [ijk, ijk + AXES[edge.axis]].map(|p| self.winding.at(p.as_dvec3()) - 0.5);
+        // At the edge of a sheet the two may not bracket ½, where the sign came from crossings.
+        if a * b < 0.0 { a / (a - b) } else { 0.5 }
+    }
+}
+
+/// A voxel and the axis to its upper neighbour.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+struct OpenEdge {
+    ijk: [i32; 3],
+    axis: usize,
+}
+
+/// The voxels of a leaf whose upper neighbour along `axis` is on the other side, as far as that is known.
+fn differing(mask: &LeafMask, beyond: Option<&LeafMask>, axis: usize) -> LeafMask {
+    /// In a word, the voxels with z = 0.
+    const Z_FIRST: u64 = 0x0101_0101_0101_0101;
+    let m = &mask.0;
+    // Where nothing is known beyond, the last layer is its own neighbour.
+    let edge = beyond.map_or_else(
+        || match axis {
+            0 => LeafMask([m[7]; 8]),
+            1 => LeafMask(m.map(|w| w >> 56)),
+            _ => LeafMask(m.map(|w| w >> 7 & Z_FIRST)),
+        },
+        |b| *b,
+    );
+    LeafMask(std::array::from_fn(|x| {
+        let upper = match axis {
+            0 => m.get(x + 1).copied().unwrap_or(edge.0[0]),
+            1 => m[x] >> 8 | edge.0[x] << 56,
+            _ => (m[x] >> 1 & !(Z_FIRST << 7)) | (edge.0[x] & Z_FIRST) << 7,
+        };
+        m[x] ^ upper
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::grid::{LEAF_VOXELS, offset_to_local};
+
+    #[test]
+    fn differing_by_words_equals_differing_by_voxels() {
+        let random = |salt: usize| {
+            let mut mask = LeafMask::EMPTY;
+            (0..LEAF_VOXELS).for_each(|o| mask.set(o, crate::mesh::testing::noise(o + salt) < 0.5));
+            mask
+        };
+        let mask = random(0);
+        for beyond in [None, Some(random(1000))] {
+            for (axis, step) in AXES.into_iter().enumerate() {
+                let result = differing(&mask, beyond.as_ref(), axis);
+                for o in 0..LEAF_VOXELS {
+                    let next = offset_to_local(o) + step;
+                    let other = if leaf_origin(next) == IVec3::ZERO {
+                        mask.get(leaf_offset(next))
+                    } else {
+                        beyond.map_or(mask.get(o), |b| b.get(leaf_offset(next)))
+                    };
+                    assert_eq!(result.get(o), mask.get(o) != other, "{axis} {o}");
+                }
+            }
+        }
+    }
+}
