@@ -205,6 +205,19 @@ impl Grid {
         removed.into_iter().map(|(id, _)| id).collect()
     }
 
+    /// Removes leaves, whatever they hold; the space takes the sign `inside`.
+    pub fn remove_leaves(&mut self, leaves: &[LeafId], inside: bool) {
+        let removed: Vec<_> = leaves.iter().map(|&id| (id, LeafId::sentinel(inside))).collect();
+        if !removed.is_empty() {
+            Arc::make_mut(&mut self.topology).remove(&removed);
+        }
+    }
+
+    /// Where neither this grid nor `other` has a leaf, the sign becomes `sign(inside here, inside there)`.
+    pub fn combine_signs(&mut self, other: &Self, sign: impl Fn(bool, bool) -> bool) {
+        Arc::make_mut(&mut self.topology).combine_signs(&other.topology, sign);
+    }
+
     /// Gives all absent leaves in the box of voxels `lo..hi` (multiples of 8, `hi` excluded) a sign.
     pub fn set_sign(&mut self, lo: IVec3, hi: IVec3, inside: bool) {
         Arc::make_mut(&mut self.topology).set_sign(lo, hi, inside);

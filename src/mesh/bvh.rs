@@ -83,6 +83,38 @@ impl Bvh {
         (aabb.min.as_dvec3(), aabb.max.as_dvec3())
     }
 
+    /// The triangles as given, in an order in which neighbours are near each other.
+    pub(crate) fn order(&self) -> &[u32] {
+        &self.tree.primitive_indices
+    }
+
+    /// Whether `f` holds for any triangle whose leaf touches the box.
+    pub(crate) fn any_in_box(&self, lo: DVec3, hi: DVec3, f: impl Fn(u32) -> bool) -> bool {
+        let mut stack = smallvec::SmallVec::<[usize; 64]>::new();
+        if self.node_count() > 0 {
+            stack.push(0);
+        }
+        while let Some(node) = stack.pop() {
+            let (node_lo, node_hi) = self.node_box(node);
+            if node_lo.cmpgt(hi).any() || node_hi.cmplt(lo).any() {
+                continue;
+            }
+            match self.children(node) {
+                Children::Nodes(pair) => stack.extend(pair),
+                Children::Triangles(list) => {
+                    let first = self.tree.nodes[node].first_index as usize;
+                    for (i, [a, b, c]) in list.iter().enumerate() {
+                        let apart = a.min(*b).min(*c).cmpgt(hi).any() || a.max(*b).max(*c).cmplt(lo).any();
+                        if !apart && f(self.tree.primitive_indices[first + i]) {
+                            return true;
+                        }
+                    }
+                }
+            }
+        }
+        false
+    }
+
     /// The nearest point to `p` on any triangle, if it is not farther than `max_distance`.
     pub fn closest_point(&self, p: DVec3, max_distance: f64) -> Option<Hit> {
         let mut best: Option<Hit> = None;

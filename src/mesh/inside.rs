@@ -12,22 +12,70 @@ use glam::{DVec3, IVec3};
 use super::WindingNumber;
 use super::crossings::Crossings;
 use super::topology::{boundary_chain, edge_uses};
+use super::winding::BATCH;
 use crate::grid::{Face, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset, leaf_origin, offset_to_local};
 
 /// Half the diagonal of the lattice of a leaf's voxels, 3.5·√3, rounded up.
 const LEAF_RADIUS: f64 = 6.1;
 /// The error of fast winding numbers, doubled.
-const WINDING_ERROR: f64 = 0.02;
+pub(crate) const WINDING_ERROR: f64 = 0.02;
 /// Neighbouring voxels whose distances to the triangles add up to more than their own distance are not separated.
 /// The excess covers the rounding of the distances.
 pub(crate) const APART: f32 = 1.0 + 1e-5;
 
-/// An edge that bounds the mesh.
-struct RimEdge {
-    middle: DVec3,
-    half_length: f64,
-    /// Length times multiplicity, over 4π.
+/// Edges in a group of the rim.
+const RIM_GROUP: usize = 32;
+
+/// A piece of the mesh's boundary as a current: a ball that holds it and its length times multiplicity, over 4π.
+#[derive(Clone, Copy)]
+struct Current {
+    center: DVec3,
+    radius: f64,
     strength: f64,
+}
+
+/// The boundary of a mesh, and how fast the winding number can change because of it.
+pub(crate) struct Rim {
+    groups: Vec<(Current, Vec<Current>)>,
+}
+
+impl Rim {
+    /// The boundary of an indexed mesh; empty if it is closed.
+    pub fn new(positions: &[DVec3], triangles: &[[u32; 3]]) -> Self {
+        let edges: Vec<Current> = boundary_chain(&edge_uses(triangles))
+            .into_iter()
+            .map(|(ends, multiplicity)| {
+                let [a, b] = ends.map(|v| positions[v as usize]);
+                let length = a.distance(b);
+                let strength = length * multiplicity.unsigned_abs() as f64 / (4.0 * PI);
+                Current { center: (a + b) * 0.5, radius: 0.5 * length, strength }
+            })
+            .collect();
+        // Vertices with near indices are mostly near each other, so the order of the edges makes fair groups.
+        let groups = edges.chunks(RIM_GROUP).map(|chunk| {
+            let center = chunk.iter().map(|e| e.center).sum::<DVec3>() / chunk.len() as f64;
+            let radius = chunk.iter().map(|e| e.center.distance(center) + e.radius).fold(0.0, f64::max);
+            (Current { center, radius, strength: chunk.iter().map(|e| e.strength).sum() }, chunk.to_vec())
+        });
+        Self { groups: groups.collect() }
+    }
+
+    /// A bound of |∇w| away from triangles in the ball around `center`; `None` if it exceeds `useless`.
+    pub fn steepest(&self, center: DVec3, radius: f64, useless: f64) -> Option<f64> {
+        let slope = |current: &Current| {
+            let distance = current.center.distance(center) - current.radius - radius;
+            if distance > 0.0 { current.strength / (distance * distance) } else { f64::INFINITY }
+        };
+        let mut sum = 0.0;
+        for (group, edges) in &self.groups {
+            let far = group.center.distance(center) > 3.0 * group.radius + radius;
+            sum += if far { slope(group) } else { edges.iter().map(slope).sum() };
+            if sum > useless {
+                return None;
+            }
+        }
+        Some(sum)
+    }
 }
 
 /// Tells inside from outside, leaf by leaf.
@@ -50,40 +98,30 @@ impl Inside<'_> {
 
 /// Inside by winding number.
 pub(crate) struct OpenInside<'a> {
-    winding: &'a WindingNumber<'a>,
-    rim: Vec<RimEdge>,
+    pub winding: &'a WindingNumber<'a>,
+    pub rim: &'a Rim,
 }
 
-impl<'a> OpenInside<'a> {
-    /// Of the indexed mesh (in index space) whose winding number is given.
-    pub fn new(winding: &'a WindingNumber<'a>, positions: &[DVec3], triangles: &[[u32; 3]]) -> Self {
-        let rim = boundary_chain(&edge_uses(triangles))
-            .into_iter()
-            .map(|(ends, multiplicity)| {
-                let [a, b] = ends.map(|v| positions[v as usize]);
-                let length = a.distance(b);
-                let strength = length * multiplicity.unsigned_abs() as f64 / (4.0 * PI);
-                RimEdge { middle: (a + b) * 0.5, half_length: 0.5 * length, strength }
-            })
-            .collect();
-        Self { winding, rim }
-    }
-
-    fn is_inside(&self, ijk: IVec3) -> bool {
-        self.winding.at(ijk.as_dvec3()) > 0.5
-    }
-
+impl OpenInside<'_> {
     fn leaf(&self, origin: IVec3, distance: Option<&LeafValues>) -> LeafMask {
-        self.by_seeds(origin, distance).unwrap_or_else(|| {
-            let mut mask = LeafMask::EMPTY;
-            (0..LEAF_VOXELS).for_each(|o| mask.set(o, self.is_inside(origin + offset_to_local(o))));
-            mask
-        })
+        self.by_seeds(origin, distance).unwrap_or_else(|| self.by_voxels(origin))
+    }
+
+    fn by_voxels(&self, origin: IVec3) -> LeafMask {
+        let mut mask = LeafMask::EMPTY;
+        for row in 0..LEAF_VOXELS / BATCH {
+            let points = std::array::from_fn(|z| (origin + offset_to_local(row * BATCH + z)).as_dvec3());
+            let w = self.winding.at_each::<BATCH>(&points);
+            w.iter().enumerate().for_each(|(z, w)| mask.set(row * BATCH + z, *w > 0.5));
+        }
+        mask
     }
 
     /// The mask from one voxel of each set of unseparated voxels, or `None` where that proves nothing.
     fn by_seeds(&self, origin: IVec3, distance: Option<&LeafValues>) -> Option<LeafMask> {
-        let slope = self.steepest(origin)?;
+        /// With this slope w changes by ½ within the leaf.
+        const USELESS: f64 = 0.5 / (2.0 * LEAF_RADIUS);
+        let slope = self.rim.steepest(origin.as_dvec3() + 3.5, LEAF_RADIUS, USELESS)?;
         let mut known = LeafMask::EMPTY;
         let mut inside = LeafMask::EMPTY;
         let mut open = Vec::new();
@@ -116,25 +154,6 @@ impl<'a> OpenInside<'a> {
         }
         Some(inside)
     }
-
-    /// A bound of |∇w| in the leaf at `origin`, away from triangles; `None` if it is too large to be of use.
-    fn steepest(&self, origin: IVec3) -> Option<f64> {
-        /// With this slope w changes by ½ within the leaf.
-        const USELESS: f64 = 0.5 / (2.0 * LEAF_RADIUS);
-        let center = origin.as_dvec3() + 3.5;
-        let mut slope = 0.0;
-        for edge in &self.rim {
-            let distance = edge.middle.distance(center) - edge.half_length - LEAF_RADIUS;
-            if distance <= 0.0 {
-                return None;
-            }
-            slope += edge.strength / (distance * distance);
-            if slope > USELESS {
-                return None;
-            }
-        }
-        Some(slope)
-    }
 }
 
 #[cfg(test)]
@@ -153,15 +172,16 @@ mod tests {
         let triangles: Vec<_> = (0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect();
         let bvh = Bvh::new(triangles.clone());
         let winding = WindingNumber::new(&bvh);
-        let open = OpenInside::new(&winding, &mesh.positions, &mesh.triangles);
+        let rim = Rim::new(&mesh.positions, &mesh.triangles);
+        let open = OpenInside { winding: &winding, rim: &rim };
         let leaves = distance_to_triangles(triangles.len(), |t| triangles[t], 3.0, &RunOptions::default()).unwrap();
         let mut seeded = 0;
         for leaf in leaves.iter().step_by(7) {
             if let Some(mask) = open.by_seeds(leaf.origin, Some(&leaf.distance)) {
                 seeded += 1;
+                let by_voxels = open.by_voxels(leaf.origin);
                 for o in 0..LEAF_VOXELS {
-                    let ijk = leaf.origin + offset_to_local(o);
-                    assert!(leaf.distance.0[o] < 1e-3 || mask.get(o) == open.is_inside(ijk), "{ijk}");
+                    assert!(leaf.distance.0[o] < 1e-3 || mask.get(o) == by_voxels.get(o), "{} {o}", leaf.origin);
                 }
             }
         }

@@ -11,6 +11,7 @@ mod findings;
 mod gltf;
 mod gltf_write;
 mod inside;
+mod intersect;
 mod obj;
 mod off;
 mod pieces;

@@ -1,15 +1,20 @@
 //! The pieces of a surface that separate an inside from an outside.
 //!
 //! Where parts of a mesh overlap, some of its area lies inside of the union and must not attract the distance; where it is
-//! a sheet, both sides are outside. A piece counts if the winding number is above ½ on one of its sides and not on the other. Triangles
-//! are cut into pieces of at most [`COARSE`] voxels, and where pieces that count lie beside pieces that do not,
-//! further down to [`FINE`].
+//! a sheet, both sides are outside. A piece counts if the winding number is above ½ on one of its sides and not on the other.
+//!
+//! Along a triangle that no other one touches the winding number changes only because of the mesh's boundary, and no
+//! faster than [`Rim`] says: such a triangle is judged by one point. Others are cut into pieces of at most
+//! [`COARSE`] voxels, and where pieces that count lie beside pieces that do not, further down to [`FINE`].
 
 use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::WindingNumber;
+use super::inside::{Rim, WINDING_ERROR};
+use super::intersect::intersecting;
+use super::winding::BATCH;
+use super::{Bvh, WindingNumber};
 
 /// Longest edge, in voxels, of the pieces that are judged first.
 const COARSE: f64 = 2.0;
@@ -27,33 +32,53 @@ pub(crate) struct Pieces {
     pub removed_area_fraction: f64,
 }
 
-/// Cuts and judges the triangles, which are in index space.
-pub(crate) fn separating_pieces(triangles: &[[DVec3; 3]], winding: &WindingNumber<'_>) -> Pieces {
-    let total: f64 = triangles.iter().map(area).sum();
+/// Cuts and judges the triangles of an indexed mesh in index space.
+pub(crate) fn separating_pieces(
+    positions: &[DVec3],
+    triangles: &[[u32; 3]],
+    bvh: &Bvh,
+    winding: &WindingNumber<'_>,
+    rim: &Rim,
+) -> Pieces {
+    let crossed = intersecting(bvh, positions, triangles);
+    let corners = |t: u32| triangles[t as usize].map(|v| positions[v as usize]);
+    let total: f64 = (0..triangles.len() as u32).map(|t| area(&corners(t))).sum();
     let mut removed = 0.0;
     let mut kept = Vec::new();
-    let mut size = COARSE;
-    let mut open: Vec<[DVec3; 3]> = triangles.par_iter().flat_map_iter(|&t| cut(t, size)).collect();
-    loop {
-        let counts: Vec<bool> = open.par_iter().map(|piece| separates(piece, winding)).collect();
-        let cell = |piece: &[DVec3; 3]| ((piece[0] + piece[1] + piece[2]) / (3.0 * size)).floor().as_i64vec3();
-        let mut cells: FxHashMap<I64Vec3, [bool; 2]> = FxHashMap::default();
-        if size > FINE {
-            for (piece, &counts) in open.iter().zip(&counts) {
-                cells.entry(cell(piece)).or_default()[usize::from(counts)] = true;
-            }
+    let mut open = Vec::new();
+    // In the order of the tree, so that those judged together lie together.
+    let (mut whole, others): (Vec<u32>, Vec<u32>) = bvh.order().iter().partition(|&&t| !crossed[t as usize]);
+    let verdicts: Vec<Option<bool>> = whole
+        .par_chunks(BATCH)
+        .flat_map_iter(|chunk| {
+            let fronts = by_batch(chunk, |&t| beside(&corners(t), 1.0), winding);
+            chunk.iter().zip(fronts).map(|(&t, front)| verdict_by_one_point(corners(t), front, rim)).collect::<Vec<_>>()
+        })
+        .collect();
+    let mut verdicts = verdicts.into_iter();
+    whole.retain(|&t| match verdicts.next().flatten() {
+        Some(true) => {
+            kept.push(corners(t));
+            false
         }
-        // Only where both kinds occur at all is there a border.
-        let mixed = cells.values().any(|c| c[0]) && cells.values().any(|c| c[1]);
-        let at_border = |piece: &[DVec3; 3], counts: bool| {
-            let center = cell(piece);
-            mixed
-                && (0..27).any(|i| {
-                    let neighbour = center + I64Vec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1);
-                    cells.get(&neighbour).is_some_and(|c| c[usize::from(!counts)])
-                })
-        };
-        let border: Vec<bool> = open.par_iter().zip(&counts).map(|(piece, &counts)| at_border(piece, counts)).collect();
+        Some(false) => {
+            removed += area(&corners(t));
+            false
+        }
+        None => true,
+    });
+    let mut size = COARSE;
+    open.extend(whole.par_iter().chain(&others).flat_map_iter(|&t| cut(corners(t), size)).collect::<Vec<_>>());
+    while !open.is_empty() {
+        let counts: Vec<bool> = open
+            .par_chunks(BATCH)
+            .flat_map_iter(|chunk| {
+                let fronts = by_batch(chunk, |piece| beside(piece, 1.0), winding);
+                let backs = by_batch(chunk, |piece| beside(piece, -1.0), winding);
+                fronts.into_iter().zip(backs).map(|(front, back)| (front > 0.5) != (back > 0.5)).collect::<Vec<_>>()
+            })
+            .collect();
+        let border = if size > FINE { borders(&open, &counts, size) } else { vec![false; open.len()] };
         let mut next = Vec::new();
         for ((piece, counts), border) in open.into_iter().zip(counts).zip(border) {
             match (border, counts) {
@@ -62,26 +87,68 @@ pub(crate) fn separating_pieces(triangles: &[[DVec3; 3]], winding: &WindingNumbe
                 (false, false) => removed += area(&piece),
             }
         }
-        if next.is_empty() {
-            break;
-        }
         open = next;
         size /= 2.0;
     }
     Pieces { kept, removed_area_fraction: if total > 0.0 { removed / total } else { 0.0 } }
 }
 
-fn area([a, b, c]: &[DVec3; 3]) -> f64 {
-    0.5 * (b - a).cross(c - a).length()
+/// Whether a triangle that no other one touches counts, from the winding number in front of its centre; behind it is one
+/// more. `None` if that might differ elsewhere on the triangle.
+fn verdict_by_one_point(corners: [DVec3; 3], front: f64, rim: &Rim) -> Option<bool> {
+    let center = (corners[0] + corners[1] + corners[2]) / 3.0;
+    let radius = corners.iter().map(|c| c.distance(center)).fold(0.0, f64::max);
+    let slope = rim.steepest(center, radius, 0.5 / radius.max(f64::MIN_POSITIVE))?;
+    let margin = WINDING_ERROR + slope * radius;
+    // Changes at front = −½ and ½.
+    ((front.abs() - 0.5).abs() > margin).then_some(front.abs() < 0.5)
 }
 
-/// Whether the two sides of a piece differ.
-fn separates(piece: &[DVec3; 3], winding: &WindingNumber<'_>) -> bool {
+/// A point just beside a piece, in front of it or behind it.
+fn beside(piece: &[DVec3; 3], side: f64) -> DVec3 {
     let [a, b, c] = piece;
-    let Some(normal) = (b - a).cross(c - a).try_normalize() else { return false };
-    let center = (a + b + c) / 3.0;
-    let side = |sign: f64| winding.at(center + normal * (sign * BESIDE)) > 0.5;
-    side(1.0) != side(-1.0)
+    (a + b + c) / 3.0 + (b - a).cross(c - a).normalize_or_zero() * (side * BESIDE)
+}
+
+/// Winding numbers at a point each of up to [`BATCH`] things.
+fn by_batch<T>(things: &[T], point: impl Fn(&T) -> DVec3, winding: &WindingNumber<'_>) -> Vec<f64> {
+    let Some(last) = things.last() else { return Vec::new() };
+    let points = std::array::from_fn(|i| point(things.get(i).unwrap_or(last)));
+    winding.at_each::<BATCH>(&points)[..things.len().min(BATCH)].to_vec()
+}
+
+/// Which pieces lie beside a piece of the other kind.
+fn borders(pieces: &[[DVec3; 3]], counts: &[bool], size: f64) -> Vec<bool> {
+    // Centroids of pieces that touch are within 4/3 of the longest edge: in this cell or the next.
+    let edge = size * 4.0 / 3.0;
+    let center = |piece: &[DVec3; 3]| (piece[0] + piece[1] + piece[2]) / 3.0;
+    let cell = |p: DVec3| (p / edge).floor().as_i64vec3();
+    let mut cells: FxHashMap<I64Vec3, [Vec<DVec3>; 2]> = FxHashMap::default();
+    let differ = counts.iter().any(|&c| c) && counts.iter().any(|&c| !c);
+    if !differ {
+        return vec![false; pieces.len()];
+    }
+    for (piece, &counts) in pieces.iter().zip(counts) {
+        let center = center(piece);
+        cells.entry(cell(center)).or_default()[usize::from(counts)].push(center);
+    }
+    pieces
+        .par_iter()
+        .zip(counts)
+        .map(|(piece, &counts)| {
+            let center = center(piece);
+            let middle = cell(center);
+            (0..27).any(|i| {
+                let neighbour = middle + I64Vec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1);
+                let others = cells.get(&neighbour).map_or(&[][..], |c| &c[usize::from(!counts)]);
+                others.iter().any(|other| other.distance_squared(center) <= edge * edge)
+            })
+        })
+        .collect()
+}
+
+fn area([a, b, c]: &[DVec3; 3]) -> f64 {
+    0.5 * (b - a).cross(c - a).length()
 }
 
 /// Cuts a triangle into pieces whose edges are not longer than `size`: in halves across the longest edge, and what is
@@ -137,13 +204,13 @@ fn slice([from, to, apex]: [DVec3; 3], size: f64, done: &mut Vec<[DVec3; 3]>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mesh::TriangleMesh;
     use crate::mesh::testing::*;
-    use crate::mesh::{Bvh, TriangleMesh};
 
     fn pieces(mesh: &TriangleMesh) -> Pieces {
-        let triangles: Vec<_> = (0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect();
-        let bvh = Bvh::new(triangles.clone());
-        separating_pieces(&triangles, &WindingNumber::new(&bvh))
+        let bvh = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect());
+        let rim = Rim::new(&mesh.positions, &mesh.triangles);
+        separating_pieces(&mesh.positions, &mesh.triangles, &bvh, &WindingNumber::new(&bvh), &rim)
     }
 
     #[test]

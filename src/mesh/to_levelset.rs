@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use super::closure::{DistanceLeaves, Surroundings};
 use super::crossings::Crossings;
-use super::inside::{Inside, OpenInside};
+use super::inside::{Inside, OpenInside, Rim};
 use super::pieces::separating_pieces;
 use super::prepare::prepare;
 use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes};
@@ -112,17 +112,19 @@ fn repair(
     run: &RunOptions,
 ) -> Result<Vec<SignedLeaf>> {
     let half_width = params.half_width;
-    let triangles: Vec<[DVec3; 3]> = (0..clean.triangles.len()).map(|t| clean.corners(t)).collect();
-    let bvh = Bvh::new(triangles.clone());
+    let bvh = Bvh::new((0..clean.triangles.len()).map(|t| clean.corners(t)).collect());
     let winding = WindingNumber::new(&bvh);
+    let rim = Rim::new(&clean.positions, &clean.triangles);
     let inside = match crossings {
         Some(crossings) => Inside::Closed(crossings),
-        None => Inside::Open(OpenInside::new(&winding, &clean.positions, &clean.triangles)),
+        None => Inside::Open(OpenInside { winding: &winding, rim: &rim }),
     };
     run.check(OPERATION)?;
-    let pieces = separating_pieces(&triangles, &winding);
+    let t0 = std::time::Instant::now();
+    let pieces = separating_pieces(&clean.positions, &clean.triangles, &bvh, &winding, &rim);
     findings.removed_area_fraction = pieces.removed_area_fraction;
     run.check(OPERATION)?;
+    println!("  pieces {:?} kept {}", t0.elapsed(), pieces.kept.len());
     let all = DistanceLeaves::new(distances);
     let kept = if pieces.removed_area_fraction > 0.0 {
         distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?
@@ -132,6 +134,7 @@ fn repair(
     let mut kept = DistanceLeaves::new(kept);
     let mut surroundings = Surroundings::new(&inside, &winding, &all);
     let closure = surroundings.close(&kept, half_width, run)?;
+    println!("  close {:?}", t0.elapsed());
     findings.closure_triangles = closure.len();
     kept.merge(distance_to_triangles(closure.len(), |t| closure[t], half_width, run)?);
     let unsigned: Vec<_> = kept.origins().filter(|o| surroundings.mask(*o).is_none()).collect();

@@ -1,0 +1,106 @@
+//! Which triangles of a mesh pass through each other.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::Bvh;
+
+/// Triangles nearer than this (voxels) touch: rounding must not hide that two coincide.
+const TOUCH: f64 = 1e-3;
+
+/// Marks the triangles that another one crosses, overlaps or touches otherwise than at the vertices that they share.
+/// `bvh` holds the triangles of the indexed mesh in its order. Neighbours over an edge are not looked at.
+pub(crate) fn intersecting(bvh: &Bvh, positions: &[DVec3], triangles: &[[u32; 3]]) -> Vec<bool> {
+    let corners = |t: u32| triangles[t as usize].map(|v| positions[v as usize]);
+    (0..triangles.len() as u32)
+        .into_par_iter()
+        .with_min_len(256)
+        .map(|t| {
+            let own = corners(t);
+            let (lo, hi) = (own[0].min(own[1]).min(own[2]) - TOUCH, own[0].max(own[1]).max(own[2]) + TOUCH);
+            bvh.any_in_box(lo, hi, |other| {
+                if other == t {
+                    return false;
+                }
+                let shared = |v: &u32| triangles[other as usize].contains(v);
+                match triangles[t as usize].iter().filter(|v| shared(v)).count() {
+                    0 => touch(own, corners(other)),
+                    1 => {
+                        // Beyond the vertex they meet if and only if the edge opposite to it of one meets the other.
+                        let far_edge = |a: u32, b: u32| {
+                            let common = |v: &&u32| triangles[b as usize].contains(v);
+                            let mut rest =
+                                triangles[a as usize].iter().filter(|v| !common(v)).map(|&v| positions[v as usize]);
+                            Some([rest.next()?, rest.next()?])
+                        };
+                        let meets = |edge: Option<[DVec3; 2]>, triangle: [DVec3; 3]| {
+                            edge.is_some_and(|[a, b]| touch([a, b, b], triangle))
+                        };
+                        meets(far_edge(t, other), corners(other)) || meets(far_edge(other, t), own)
+                    }
+                    _ => false,
+                }
+            })
+        })
+        .collect()
+}
+
+/// Whether two triangles, which may be segments, come within [`TOUCH`] of each other: no axis separates them, neither a
+/// normal, nor a common perpendicular of two edges, nor an edge's perpendicular within its triangle's plane.
+fn touch(a: [DVec3; 3], b: [DVec3; 3]) -> bool {
+    let edges = |t: [DVec3; 3]| [t[1] - t[0], t[2] - t[1], t[0] - t[2]];
+    let (ea, eb) = (edges(a), edges(b));
+    let (na, nb) = (ea[0].cross(ea[1]), eb[0].cross(eb[1]));
+    let separates = |axis: DVec3| {
+        let Some(axis) = axis.try_normalize() else { return false };
+        let range = |t: [DVec3; 3]| {
+            let [x, y, z] = t.map(|corner| axis.dot(corner - a[0]));
+            (x.min(y).min(z), x.max(y).max(z))
+        };
+        let ((a_lo, a_hi), (b_lo, b_hi)) = (range(a), range(b));
+        a_hi + TOUCH < b_lo || b_hi + TOUCH < a_lo
+    };
+    let in_plane = ea.iter().map(|e| na.cross(*e)).chain(eb.iter().map(|e| nb.cross(*e)));
+    let across = ea.iter().flat_map(|x| eb.iter().map(|y| x.cross(*y)));
+    ![na, nb].into_iter().chain(in_plane).chain(across).any(separates)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::TriangleMesh;
+    use crate::mesh::testing::*;
+
+    fn count(mesh: &TriangleMesh) -> usize {
+        let bvh = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect());
+        intersecting(&bvh, &mesh.positions, &mesh.triangles).iter().filter(|&&i| i).count()
+    }
+
+    #[test]
+    fn neighbours_on_a_surface_do_not_intersect() {
+        assert_eq!(count(&sphere(DVec3::ZERO, 50.0, 20)), 0);
+        assert_eq!(count(&cube(DVec3::ZERO, 50.0)), 0);
+    }
+
+    #[test]
+    fn crossing_touching_and_coincident_triangles_do() {
+        let a = cube(DVec3::ZERO, 10.0);
+        assert!(count(&joined(a.clone(), &cube(DVec3::splat(5.0), 10.0))) >= 12);
+        assert_eq!(count(&joined(a.clone(), &cube(DVec3::splat(2.0), 5.0))), 0, "within, not crossing");
+        // Two face to face: the two triangles of each of the faces, and the edges of the faces around.
+        assert!(count(&joined(a.clone(), &cube(DVec3::X * 10.0, 10.0))) >= 4);
+        assert_eq!(count(&joined(a, &cube(DVec3::X * 10.1, 10.0))), 0);
+    }
+
+    #[test]
+    fn fans_that_fold_through_themselves_do() {
+        // Two triangles that share a vertex; the far edge of one passes through the other.
+        let positions =
+            vec![DVec3::ZERO, DVec3::X * 4.0, DVec3::Y * 4.0, DVec3::new(2.0, 1.0, -1.0), DVec3::new(1.0, 2.0, 1.0)];
+        let mesh = TriangleMesh { positions, triangles: vec![[0, 1, 2], [0, 3, 4]], ..TriangleMesh::default() };
+        assert_eq!(count(&mesh), 2);
+        let mut apart = mesh;
+        apart.positions[3].z = 1.0;
+        assert_eq!(count(&apart), 0);
+    }
+}
