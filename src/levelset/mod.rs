@@ -4,12 +4,22 @@
 //! ±background; background = half width · voxel size. `check` verifies these invariants.
 
 mod build;
+mod check;
+mod components;
+pub(crate) mod isosurface;
 mod lattice;
+pub(crate) mod marching;
+mod measure;
 mod sample;
 pub mod shapes;
+#[cfg(test)]
+pub(crate) mod testing;
+mod union_find;
 
 use glam::{DVec3, IVec3};
 
+pub use check::{Violation, ViolationKind};
+pub use measure::Measures;
 pub(crate) use build::grid_of_leaves;
 pub use sample::Sampler;
 

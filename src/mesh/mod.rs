@@ -8,6 +8,7 @@ mod color;
 mod crossings;
 pub mod files;
 mod findings;
+mod from_levelset;
 mod gltf;
 mod gltf_write;
 mod inside;
@@ -37,6 +38,8 @@ pub use topology::{Topology, analyze};
 pub use winding::WindingNumber;
 
 use glam::DVec3;
+
+pub use from_levelset::level_set_to_mesh;
 
 /// An indexed triangle mesh in world units.
 ///
