@@ -12,6 +12,7 @@ pub mod mesh;
 pub mod ops;
 pub mod pde;
 pub mod region;
+pub mod render;
 pub mod run;
 pub mod spec;
 pub mod stencil;
