@@ -177,7 +177,7 @@ impl Entry {
 }
 
 /// All operators, in the order of the manual.
-pub static REGISTRY: &[Entry] = &[Entry::of::<super::smooth::Smooth>()];
+pub static REGISTRY: &[Entry] = &[Entry::of::<super::csg::Csg>(), Entry::of::<super::smooth::Smooth>()];
 
 /// The operator of a name.
 pub fn find(name: &str) -> Result<&'static Entry> {
