@@ -6,8 +6,8 @@ use vdb_edit::LevelSet;
 use vdb_edit::grid::Transform;
 use vdb_edit::mesh::{MeshToLevelSet, mesh_to_level_set, read};
 use vdb_edit::ops::csg::{CsgOperation, csg};
-use vdb_edit::ops::{EvolutionOptions, Like, Scheme};
 use vdb_edit::ops::smooth::{Smooth, SmoothMethod, smooth};
+use vdb_edit::ops::{EvolutionOptions, Like, Scheme};
 use vdb_edit::pde::{SolverOptions, UpwindScheme, WenoEpsilon, renormalize, track};
 use vdb_edit::run::RunOptions;
 use vdb_edit::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceScheme, Tracker};
@@ -120,8 +120,7 @@ fn renormalisation_and_track() {
                 ][order - 1];
                 let solver =
                     SolverOptions { scheme, integrator, normalizations: 1, weno_epsilon: WenoEpsilon::OPENVDB };
-                let theirs =
-                    Tracker { scheme: reference_scheme, runge_kutta: order as u32, normalizations: 1 };
+                let theirs = Tracker { scheme: reference_scheme, runge_kutta: order as u32, normalizations: 1 };
                 let mut ours = bumpy.clone();
                 renormalize(&mut ours, &solver, &run).unwrap();
                 assert_same(name, &ours, &reference(&bumpy, Filter::Normalize, theirs), 1e-5);

@@ -68,7 +68,12 @@ mod tests {
         for sub in command().get_subcommands() {
             assert!(sub.get_about().is_some(), "{}", sub.get_name());
             for arg in sub.get_arguments() {
-                assert!(arg.get_help().is_some_and(|h| !h.to_string().is_empty()), "{} {}", sub.get_name(), arg.get_id());
+                assert!(
+                    arg.get_help().is_some_and(|h| !h.to_string().is_empty()),
+                    "{} {}",
+                    sub.get_name(),
+                    arg.get_id()
+                );
             }
         }
     }

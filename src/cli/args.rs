@@ -58,7 +58,11 @@ pub fn running(command: Command) -> Command {
                 .value_name("SIZE")
                 .value_parser(ValueParser::new(|text: &str| size::parse(text).map(MemoryLimit)))
                 .help("Refuse work that needs more memory: 500M, 2GiB, none [default: 80 % of the machine's]"),
-            Arg::new("quiet").long("quiet").short('q').action(ArgAction::SetTrue).help("Say nothing but warnings and errors"),
+            Arg::new("quiet")
+                .long("quiet")
+                .short('q')
+                .action(ArgAction::SetTrue)
+                .help("Say nothing but warnings and errors"),
             Arg::new("json")
                 .long("json")
                 .action(ArgAction::SetTrue)
@@ -90,11 +94,9 @@ pub fn running(command: Command) -> Command {
 pub fn grids(command: Command) -> Command {
     command.args(
         [
-            Arg::new("grid")
-                .long("grid")
-                .value_name("NAME")
-                .action(ArgAction::Append)
-                .help("The level set to take: NAME, or NAME[n] where several have it; given several times, one an input"),
+            Arg::new("grid").long("grid").value_name("NAME").action(ArgAction::Append).help(
+                "The level set to take: NAME, or NAME[n] where several have it; given several times, one an input",
+            ),
             Arg::new("assume-level-set")
                 .long("assume-level-set")
                 .action(ArgAction::SetTrue)

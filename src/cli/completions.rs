@@ -29,7 +29,8 @@ fn completions(matches: &ArgMatches, _: &Context) -> Result<()> {
 
 fn build_man(command: Command) -> Command {
     let of = Arg::new("command").value_name("COMMAND").help("Of this command alone");
-    let folder = args::path("output").long("output").short('o').value_name("FOLDER").help("Write all pages into a folder");
+    let folder =
+        args::path("output").long("output").short('o').value_name("FOLDER").help("Write all pages into a folder");
     command.about("Print a manual page").arg(of.conflicts_with("output")).arg(folder)
 }
 

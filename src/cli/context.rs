@@ -21,7 +21,8 @@ impl Context {
     /// Sets the process up as the arguments ask: threads, instruction set, logs.
     pub fn new(matches: &ArgMatches, reporter: Reporter) -> Result<Self> {
         let limit = matches.get_one::<MemoryLimit>("memory-limit").map_or_else(size::default_limit, |limit| limit.0);
-        let mut run = RunOptions { memory_limit: limit, ..RunOptions::default() };
+        let mut run = RunOptions::default();
+        run.memory_limit = limit;
         if let Some(display) = reporter.display() {
             run = run.with_progress(display);
         }

@@ -34,7 +34,9 @@ fn build(command: Command) -> Command {
                 .value_name("LENGTH")
                 .allow_hyphen_values(true)
                 .value_parser(ValueParser::new(options::length))
-                .help("To meshes: the surface at this distance, positive outside, in world units (or `1vx`) [default: 0]"),
+                .help(
+                    "To meshes: the surface at this distance, positive outside, in world units (or `1vx`) [default: 0]",
+                ),
         );
     args::output(args::conversion(args::grids(command), |_| false))
 }

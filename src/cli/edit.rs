@@ -170,8 +170,12 @@ impl Report<'_> {
         let Self { edit, facts, summary, bytes, output } = self;
         let Facts { before, after, voxels_changed } = facts;
         let size = bytes.map(|bytes| format!(", {}", super::size::shown(bytes))).unwrap_or_default();
-        let mut text =
-            format!("{}: {} in {:.2} s{size}\n", output.path.display(), edit.operation, edit.began.elapsed().as_secs_f64());
+        let mut text = format!(
+            "{}: {} in {:.2} s{size}\n",
+            output.path.display(),
+            edit.operation,
+            edit.began.elapsed().as_secs_f64()
+        );
         let row = |name: &str, of: fn(&Measures) -> f64| {
             let mut row = vec![name.to_owned()];
             if let Some(before) = before {

@@ -23,8 +23,10 @@ fn build(command: Command) -> Command {
         .long("check")
         .action(ArgAction::SetTrue)
         .help("Exit with 1 when a level set breaks an invariant");
-    args::grids(command.about("Say what files hold, measure level sets and verify their invariants").arg(files).arg(check))
-        .mut_arg("repair", |arg| arg.hide(true))
+    args::grids(
+        command.about("Say what files hold, measure level sets and verify their invariants").arg(files).arg(check),
+    )
+    .mut_arg("repair", |arg| arg.hide(true))
 }
 
 fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
@@ -203,7 +205,10 @@ fn grid_text(grid: &GridDescription, facts: Option<&LevelSetFacts>) -> String {
         rows.push(("memory", format!("{} in {} leaves", size::shown(facts.bytes), table::count(facts.leaves as u64))));
         rows.push(("volume", format!("{} world units³", table::number(measures.volume))));
         rows.push(("area", format!("{} world units²", table::number(measures.area))));
-        rows.push(("mean curvature", format!("{} world units, integrated", table::number(measures.mean_curvature_integral))));
+        rows.push((
+            "mean curvature",
+            format!("{} world units, integrated", table::number(measures.mean_curvature_integral)),
+        ));
         rows.push(("components", format!("{} ({} of the surface)", measures.components, measures.surface_components)));
         rows.push(("Euler number", measures.euler.to_string()));
     }
@@ -247,7 +252,10 @@ fn examine_mesh(path: &Path) -> Result<Found> {
     let mut rows = vec![
         ("vertices", table::count(vertices as u64)),
         ("triangles", table::count(triangles as u64)),
-        ("closed", if topology.closed { "yes".into() } else { format!("no, {} boundary edges", topology.boundary_edges) }),
+        (
+            "closed",
+            if topology.closed { "yes".into() } else { format!("no, {} boundary edges", topology.boundary_edges) },
+        ),
     ];
     if let Some((lo, hi)) = bounds {
         let triple = |v: DVec3| [v.x, v.y, v.z].map(table::number).join(", ");

@@ -4,15 +4,15 @@ use std::path::{Path, PathBuf};
 
 use clap::ArgMatches;
 use glam::DVec3;
-use serde_json::{Map, Value};
+use serde_json::Value;
 
+use super::args;
 use super::context::Context;
 use super::volume::{self, BandState, Choice, Volume, VolumeGrid};
-use super::args;
 use crate::error::{EditError, Result};
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, Violation, ViolationKind};
-use crate::mesh::{self, MeshFormat, MeshToLevelSet, TriangleMesh, mesh_to_level_set};
-use crate::ops::{self, VoxelLength, WorldLength};
+use crate::mesh::{self, MeshFormat, MeshToLevelSet, Rebuild, TriangleMesh, mesh_to_level_set, rebuild};
+use crate::ops::{VoxelLength, WorldLength};
 
 /// What can be read and written.
 pub const EXTENSIONS: &str = ".vdb, .obj, .ply, .stl, .glb, .gltf or .off";
@@ -147,7 +147,9 @@ fn mesh_format(path: &Path) -> Result<MeshFormat> {
     MeshFormat::of(path).ok_or_else(|| match std::fs::metadata(path) {
         Err(e) => EditError::input(path, format!("cannot be opened: {e}")),
         Ok(facts) if facts.is_dir() => EditError::input(path, "is a folder; a file is wanted"),
-        Ok(_) => EditError::input(path, format!("of an unknown kind; files are told apart by their ending: {EXTENSIONS}")),
+        Ok(_) => {
+            EditError::input(path, format!("of an unknown kind; files are told apart by their ending: {EXTENSIONS}"))
+        }
     })
 }
 
@@ -270,7 +272,7 @@ fn valid(
         name: name.clone(),
         problem: format!("{problem}; --repair or `rebuild --repair` would make it one from its surface"),
     };
-    let (level_set, rebuilt) = match grid.band {
+    let (level_set, is_rebuilt) = match grid.band {
         BandState::Regular => (grid.level_set, false),
         BandState::Trim { half_width, what } => {
             warnings.push(format!("{name}: {what}"));
@@ -279,7 +281,7 @@ fn valid(
         BandState::Rebuild { what, gross } if gross && !options.repair => return Err(refuse(what)),
         BandState::Rebuild { what, .. } => {
             warnings.push(format!("{name}: {what}: rebuilt from its surface"));
-            (rebuild(grid.level_set, context)?, true)
+            (rebuilt(&grid.level_set, context)?, true)
         }
     };
     let violations = level_set.check();
@@ -287,9 +289,9 @@ fn valid(
         return Ok(level_set);
     }
     let said = violations.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ");
-    if options.repair && !rebuilt {
+    if options.repair && !is_rebuilt {
         warnings.push(format!("{name}: {said}: rebuilt from its surface"));
-        return rebuild(level_set, context);
+        return rebuilt(&level_set, context);
     }
     if is_gross(&violations, level_set.grid().active_voxels()) {
         return Err(refuse(said));
@@ -309,13 +311,10 @@ fn is_gross(violations: &[Violation], active_voxels: u64) -> bool {
     })
 }
 
-/// Distances anew from the surface, by the operator of that name.
-fn rebuild(level_set: LevelSet, context: &Context) -> Result<LevelSet> {
-    let mut values = Map::new();
-    if level_set.half_width() < DEFAULT_HALF_WIDTH {
-        values.insert("half_width".into(), DEFAULT_HALF_WIDTH.into());
-    }
-    Ok(ops::find("rebuild")?.run(values, vec![level_set], &context.run)?.level_set)
+/// Distances anew from the surface, in a band that is wide enough for every operator.
+fn rebuilt(level_set: &LevelSet, context: &Context) -> Result<LevelSet> {
+    let half_width = level_set.half_width().max(DEFAULT_HALF_WIDTH);
+    rebuild(level_set, &Rebuild::band(half_width), &context.run)
 }
 
 #[cfg(test)]
@@ -324,7 +323,9 @@ mod tests {
 
     #[test]
     fn kinds_of_files() {
-        for (path, volume) in [("-", true), ("a.vdb", true), ("a.VDB", true), ("a.obj", false), ("a", false), ("vdb", false)] {
+        for (path, volume) in
+            [("-", true), ("a.vdb", true), ("a.VDB", true), ("a.obj", false), ("a", false), ("vdb", false)]
+        {
             assert_eq!(is_volume(Path::new(path)), volume, "{path}");
         }
         #[cfg(target_os = "linux")]

@@ -5,7 +5,7 @@
 //! option's name, and [`SEQUENCES`] are lists whose entries have options of their own and keep the order in which they were
 //! typed.
 
-use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
+use clap::builder::{BoolValueParser, PossibleValuesParser, TypedValueParser, ValueParser};
 use clap::{Arg, ArgAction, ArgMatches, Command};
 use serde_json::{Map, Number, Value};
 
@@ -246,7 +246,7 @@ impl Kind {
 
     fn parser(&self) -> ValueParser {
         match self {
-            Self::Flag => clap::value_parser!(bool).map(Value::Bool).into(),
+            Self::Flag => BoolValueParser::new().map(Value::Bool).into(),
             Self::Words(words) => PossibleValuesParser::new(words.clone()).map(Value::String).into(),
             Self::Integer => ValueParser::new(integer),
             Self::Number => ValueParser::new(number),
@@ -352,7 +352,8 @@ mod tests {
     #[test]
     fn regions_keep_their_order() {
         let smooth = REGISTRY.iter().find(|e| e.name == "smooth").unwrap();
-        let values = parse(smooth, &["--region", "a", "--region-not", "b", "--region", "c", "--region-or", "d"]).unwrap();
+        let values =
+            parse(smooth, &["--region", "a", "--region-not", "b", "--region", "c", "--region-or", "d"]).unwrap();
         assert_eq!(values["region"], serde_json::json!(["a", "not b", "c", "or d"]));
         assert!(parse(smooth, &["--region", "--region-not"]).is_err());
     }

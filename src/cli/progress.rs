@@ -99,7 +99,8 @@ impl Display {
             Style::Bar => Ok(()),
             Style::Lines => writeln!(stderr, "{}: {:.0} % ({seconds:.1} s)", shown.name, progress * 100.0),
             Style::Json => {
-                let event = json!({ "event": "progress", "task": shown.name, "progress": progress, "seconds": seconds });
+                let event =
+                    json!({ "event": "progress", "task": shown.name, "progress": progress, "seconds": seconds });
                 writeln!(stderr, "{event}")
             }
         };

@@ -54,13 +54,20 @@ fn build(command: Command) -> Command {
             option("camera", "AZIMUTH,ELEVATION[,FOV]")
                 .allow_hyphen_values(true)
                 .value_parser(ValueParser::new(camera))
-                .help("Where from, in degrees: around the up axis, above the horizon, field of view [default: 35,20,28]"),
+                .help(
+                    "Where from, in degrees: around the up axis, above the horizon, field of view [default: 35,20,28]",
+                ),
         )
-        .arg(option("up", "y|z").value_parser(["y", "z"]).hide_possible_values(true).help("The axis that points up [default: y]"))
         .arg(
-            option("range", "NUMBER")
-                .value_parser(value_parser!(f64))
-                .help("Where colours saturate: curvature in 1/voxel [default: 0.125], difference in voxels [default: 1]"),
+            option("up", "y|z")
+                .value_parser(["y", "z"])
+                .hide_possible_values(true)
+                .help("The axis that points up [default: y]"),
+        )
+        .arg(
+            option("range", "NUMBER").value_parser(value_parser!(f64)).help(
+                "Where colours saturate: curvature in 1/voxel [default: 0.125], difference in voxels [default: 1]",
+            ),
         )
         .arg(
             option("turntable", "N")
@@ -68,7 +75,9 @@ fn build(command: Command) -> Command {
                 .help("N pictures once around: #### in OUT.png becomes the number, or it is put before the ending"),
         )
         .arg(option("transparent", "").num_args(0).action(ArgAction::SetTrue).help("Leave the background transparent"))
-        .arg(option("dry-run", "").num_args(0).action(ArgAction::SetTrue).help("Say what would be done; write nothing"));
+        .arg(
+            option("dry-run", "").num_args(0).action(ArgAction::SetTrue).help("Say what would be done; write nothing"),
+        );
     args::conversion(args::grids(command), |_| false)
 }
 

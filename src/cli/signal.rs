@@ -33,7 +33,8 @@ fn code_of(signal: i32) -> u8 {
 
 /// From now on signals cancel `run`.
 pub fn watch(run: &RunOptions) -> Result<()> {
-    let failed = |e: std::io::Error| EditError::Unmet { operation: "watching for signals".into(), problem: e.to_string() };
+    let failed =
+        |e: std::io::Error| EditError::Unmet { operation: "watching for signals".into(), problem: e.to_string() };
     let mut signals = Signals::new([SIGINT, SIGTERM]).map_err(failed)?;
     let cancel = run.cancel_flag();
     let work = move || {

@@ -5,7 +5,7 @@ use comfy_table::{CellAlignment, Table, presets};
 /// Rows of words in aligned columns, indented; the first column is left-aligned, the others right-aligned.
 pub fn columns(rows: impl IntoIterator<Item = Vec<String>>) -> String {
     let mut table = Table::new();
-    table.load_preset(presets::NOTHING);
+    table.load_style(presets::NOTHING);
     for row in rows {
         table.add_row(row);
     }

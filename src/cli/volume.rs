@@ -98,10 +98,9 @@ fn band_state(read: &ReadLevelSet) -> BandState {
                 false => BandState::Rebuild { what: read.band.to_string(), gross: false },
             }
         }
-        Band::Rebuild { reason } => BandState::Rebuild {
-            what: reason.clone(),
-            gross: read.facts.non_finite > 0 || read.facts.active_tiles > 0,
-        },
+        Band::Rebuild { reason } => {
+            BandState::Rebuild { what: reason.clone(), gross: read.facts.non_finite > 0 || read.facts.active_tiles > 0 }
+        }
     }
 }
 
@@ -164,7 +163,10 @@ pub fn describe(path: &Path, choice: Choice) -> Result<Description> {
     let grids = listing.grids.iter().enumerate().filter(|(index, _)| chosen.is_none_or(|c| c == *index));
     Ok(Description {
         metadata: metadata(&listing.metadata),
-        format: format!("{} (OpenVDB {}.{})", listing.file_version, listing.library_version.0, listing.library_version.1),
+        format: format!(
+            "{} (OpenVDB {}.{})",
+            listing.file_version, listing.library_version.0, listing.library_version.1
+        ),
         grids: grids.map(|(_, grid)| describe_grid(&volume, grid, choice.assume_level_set)).collect(),
     })
 }

@@ -18,9 +18,9 @@ mod union_find;
 
 use glam::{DVec3, IVec3};
 
+pub(crate) use build::grid_of_leaves;
 pub use check::{Violation, ViolationKind};
 pub use measure::Measures;
-pub(crate) use build::grid_of_leaves;
 pub use sample::Sampler;
 
 use crate::grid::{Grid, Transform};

@@ -19,6 +19,7 @@ mod pieces;
 mod ply;
 mod polygon;
 mod prepare;
+mod rebuild;
 mod scatter;
 mod stl;
 #[cfg(test)]
@@ -31,15 +32,15 @@ mod winding;
 pub use bvh::{Bvh, Hit};
 pub use files::{MeshFormat, ReadMesh, read, write, write_to};
 pub use findings::MeshFindings;
+pub use from_levelset::level_set_to_mesh;
 pub use prepare::{prepare, weld_equal};
+pub use rebuild::{Rebuild, onto_lattice, rebuild, with_half_width};
 pub use scatter::{UnsignedLeaf, distance_to_triangles};
 pub use to_levelset::{MeshToLevelSet, mesh_to_level_set};
 pub use topology::{Topology, analyze};
 pub use winding::WindingNumber;
 
 use glam::DVec3;
-
-pub use from_levelset::level_set_to_mesh;
 
 /// An indexed triangle mesh in world units.
 ///

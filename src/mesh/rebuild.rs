@@ -44,7 +44,12 @@ pub fn rebuild(level_set: &LevelSet, what: &Rebuild, run: &RunOptions) -> Result
     let voxel_size = transform.voxel_size();
     let Rebuild { half_width, iso, offset } = *what;
     if !(iso.abs() < level_set.background()) {
-        return Err(EditError::parameter(OPERATION, "iso", iso, format!("less than the band, {}", level_set.background())));
+        return Err(EditError::parameter(
+            OPERATION,
+            "iso",
+            iso,
+            format!("less than the band, {}", level_set.background()),
+        ));
     }
     let offset = offset / voxel_size;
     let reach = offset.abs() + f64::from(half_width);
@@ -131,7 +136,12 @@ fn index_bounds(positions: &[DVec3], reach: f64) -> Result<(IVec3, IVec3)> {
     let (lo, hi) = (lo - reach - 1.0, hi + reach + 1.0);
     let limit = f64::from(crate::grid::MAX_COORD);
     if lo.abs().max(hi.abs()).max_element() > limit {
-        return Err(EditError::parameter(OPERATION, "offset", reach, "a distance that stays within 2^30 voxels of the origin"));
+        return Err(EditError::parameter(
+            OPERATION,
+            "offset",
+            reach,
+            "a distance that stays within 2^30 voxels of the origin",
+        ));
     }
     Ok((lo.floor().as_ivec3(), hi.ceil().as_ivec3()))
 }

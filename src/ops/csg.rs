@@ -74,7 +74,8 @@ impl Operator for Csg {
 
 /// Brings level sets onto the lattice of the finest, with its half width; says what was changed.
 pub fn align(mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<(Vec<LevelSet>, Vec<String>)> {
-    let Some(finest) = (0..inputs.len()).min_by(|&a, &b| inputs[a].voxel_size().total_cmp(&inputs[b].voxel_size())) else {
+    let Some(finest) = (0..inputs.len()).min_by(|&a, &b| inputs[a].voxel_size().total_cmp(&inputs[b].voxel_size()))
+    else {
         return Ok((inputs, Vec::new()));
     };
     let (transform, half_width) = (*inputs[finest].transform(), inputs[finest].half_width());
@@ -97,7 +98,11 @@ pub fn align(mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<(Vec<LevelSe
         }
         if input.background() != inputs_background(&transform, half_width) {
             if (input.half_width() - half_width).abs() >= 1e-3 {
-                warnings.push(format!("input {}: its band of {} voxels was made {half_width} wide", i + 1, input.half_width()));
+                warnings.push(format!(
+                    "input {}: its band of {} voxels was made {half_width} wide",
+                    i + 1,
+                    input.half_width()
+                ));
             }
             *input = with_half_width(input, half_width, run)?;
         }

@@ -54,14 +54,7 @@ pub struct CameraSpec {
 
 impl Default for CameraSpec {
     fn default() -> Self {
-        Self {
-            azimuth: 35.0,
-            elevation: 20.0,
-            field_of_view: 28.0,
-            margin: 0.06,
-            up: UpAxis::Y,
-            frame: Frame::Surface,
-        }
+        Self { azimuth: 35.0, elevation: 20.0, field_of_view: 28.0, margin: 0.06, up: UpAxis::Y, frame: Frame::Surface }
     }
 }
 

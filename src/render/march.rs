@@ -180,7 +180,11 @@ impl Cubic {
         let mut s = 0.5 * (a + b);
         for _ in 0..24 {
             let value = self.at(s);
-            if value > 0.0 { a = s } else { b = s }
+            if value > 0.0 {
+                a = s
+            } else {
+                b = s
+            }
             let newton = s - value / (c1 + s * (2.0 * c2 + s * 3.0 * c3));
             let next = if newton > a && newton < b { newton } else { 0.5 * (a + b) };
             if (next - s).abs() < 1e-9 {

@@ -122,7 +122,11 @@ impl RenderOptions {
         if let Some(range) = self.range
             && !(range > 0.0 && range.is_finite())
         {
-            return refuse("range", range.to_string(), "take a positive number (1/voxel for curvature, voxels for difference)");
+            return refuse(
+                "range",
+                range.to_string(),
+                "take a positive number (1/voxel for curvature, voxels for difference)",
+            );
         }
         let CameraSpec { azimuth, elevation, field_of_view, margin, frame, .. } = self.camera;
         if !azimuth.is_finite() {

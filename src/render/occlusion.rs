@@ -76,7 +76,8 @@ pub(super) fn visibility(
             let [u, v] = set_point(k, light.key_rays, class);
             let (sin, cos) = (std::f64::consts::TAU * v).sin_cos();
             let direction = (light.key + (a * cos + b * sin) * (u.sqrt() * LIGHT_RADIUS)).normalize();
-            seen += usize::from(scene.hit(cursor, &Ray::new(origin, direction), Start::Surface, f64::INFINITY).is_none());
+            seen +=
+                usize::from(scene.hit(cursor, &Ray::new(origin, direction), Start::Surface, f64::INFINITY).is_none());
         }
         seen as f64 / light.key_rays as f64
     };

@@ -82,9 +82,9 @@ pub(super) fn decode([r, g, b]: [u8; 3]) -> DVec3 {
 /// 8-bit sRGB from linear 0..1. `dither` (0..1) decides which of the two nearest values is taken: smooth gradients keep
 /// no bands.
 pub(super) fn encode(linear: DVec3, dither: f64) -> [u8; 3] {
-    let srgb = linear.clamp(DVec3::ZERO, DVec3::ONE).map(|c| {
-        if c <= 0.003_130_8 { c * 12.92 } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 }
-    });
+    let srgb = linear
+        .clamp(DVec3::ZERO, DVec3::ONE)
+        .map(|c| if c <= 0.003_130_8 { c * 12.92 } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 });
     // Within a hair of a whole number there is nothing to dither: white stays white.
     srgb.to_array().map(|c| (c * 255.0 + 0.02 + 0.96 * dither).floor().min(255.0) as u8)
 }

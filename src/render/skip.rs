@@ -25,7 +25,8 @@ pub(super) struct SkipMap {
 impl SkipMap {
     /// The map of a grid; `None` when no cell of it changes sign.
     pub fn new(grid: &Grid) -> Option<Self> {
-        let mut marked: Vec<IVec3> = grid.map_leaves(|id| leaves_with_surface(grid, id)).into_iter().flatten().collect();
+        let mut marked: Vec<IVec3> =
+            grid.map_leaves(|id| leaves_with_surface(grid, id)).into_iter().flatten().collect();
         marked.extend(bare_faces(grid));
         let lo = marked.iter().copied().reduce(IVec3::min)?;
         let hi = marked.iter().copied().reduce(IVec3::max)?;
@@ -51,8 +52,7 @@ impl SkipMap {
 
     /// Two passes over all blocks, each looking at the 13 neighbours that the pass has seen: exact in the maximum norm.
     fn spread(&mut self) {
-        let before: Vec<IVec3> =
-            (0..13).map(|q| IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1)).collect();
+        let before: Vec<IVec3> = (0..13).map(|q| IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1)).collect();
         let count = self.distance.len();
         for backwards in [false, true] {
             for i in 0..count {
@@ -62,8 +62,11 @@ impl SkipMap {
                     continue;
                 }
                 let flat = at as i32;
-                let local =
-                    IVec3::new(flat / (self.size.y * self.size.z), flat / self.size.z % self.size.y, flat % self.size.z);
+                let local = IVec3::new(
+                    flat / (self.size.y * self.size.z),
+                    flat / self.size.z % self.size.y,
+                    flat % self.size.z,
+                );
                 for &step in &before {
                     let beside = if backwards { local - step } else { local + step };
                     if beside.cmpge(IVec3::ZERO).all() && beside.cmplt(self.size).all() {

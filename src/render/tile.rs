@@ -184,8 +184,7 @@ impl Picture<'_> {
                 let at = window.index(x + dx, y + dy);
                 if let Some(other) = &hits[at] {
                     let distance = hit.footprint * (dx.abs().max(dy.abs()) + 1) as f64;
-                    let weight =
-                        filter_weight(dx) * filter_weight(dy) * hit.point.affinity(&other.point, distance);
+                    let weight = filter_weight(dx) * filter_weight(dy) * hit.point.affinity(&other.point, distance);
                     sum += weight;
                     sky += weight * values[at].sky;
                     key += weight * values[at].key;
