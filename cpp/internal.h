@@ -33,8 +33,8 @@ openvdb::FloatGrid::Ptr make_float_grid(double background);
 /// The linear transform of a row-major 4x4 matrix that acts on columns.
 openvdb::math::Transform::Ptr linear_transform(rust::Slice<const double> matrix);
 
-/// While one exists, what OpenVDB prints to std::cout goes to the log that `take_log` returns. Debian's library logs
-/// warnings through log4cplus to std::cout, which would break programs whose standard output is data.
+/// While one exists, what OpenVDB prints goes to the log that `take_log` returns. Debian's library logs warnings through
+/// log4cplus to std::cout, which would break programs whose standard output is data; its headers log to std::cerr.
 class QuietOutput {
 public:
     QuietOutput();

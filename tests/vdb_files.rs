@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DMat3, DQuat, DVec3, IVec3};
 use vdb_edit::grid::{Grid, Transform};
 use vdb_edit::run::RunOptions;
-use vdb_edit::vdb::{self, Band, Compression, FileListing, GridToWrite, MetaItem, Precision, WriteOptions};
+use vdb_edit::vdb::{self, Band, Compression, FileListing, GridToWrite, MetaItem, Precision, VdbFile, WriteOptions};
 use vdb_edit::{EditError, LevelSet};
 
 /// A file of the shared data, or `None` with a note when that is not there.
@@ -20,6 +20,10 @@ fn shared(name: &str) -> Option<PathBuf> {
         return None;
     }
     Some(path)
+}
+
+fn open(path: impl AsRef<Path>) -> vdb_edit::Result<VdbFile> {
+    vdb::open(path, &RunOptions::default())
 }
 
 fn sphere(transform: Transform, radius: f64) -> LevelSet {
@@ -86,7 +90,7 @@ fn real_level_sets_survive_an_edit_unchanged() {
     let folder = tempfile::tempdir().unwrap();
     for (name, selector, active) in files {
         let Some(path) = shared(name) else { continue };
-        let file = vdb::open(&path).unwrap();
+        let file = open(&path).unwrap();
         let read = file.read_level_set(selector, false).unwrap();
         assert_eq!(read.level_set.grid().active_voxels(), active, "{name}");
         assert_eq!(read.band, Band::Regular, "{name}: {:?}", read.facts);
@@ -95,7 +99,7 @@ fn real_level_sets_survive_an_edit_unchanged() {
         let out = folder.path().join(name);
         let grid = GridToWrite { level_set: &read.level_set, name: None, replaces: Some(read.index) };
         vdb::write(&out, &[grid], Some(&file), &WriteOptions::default()).unwrap();
-        let back = vdb::open(&out).unwrap();
+        let back = open(&out).unwrap();
         assert_same_except(file.listing(), back.listing(), Some(read.index));
         for index in 0..file.listing().grids.len() {
             assert_eq!(file.fingerprint(index).unwrap(), back.fingerprint(index).unwrap(), "{name} grid {index}");
@@ -128,12 +132,12 @@ fn real_files_without_a_level_set_are_refused_for_their_reason() {
     ];
     for (name, selector, reason) in refusals {
         let Some(path) = shared(name) else { continue };
-        let error = input_error(vdb::open(&path).unwrap().read_level_set(selector, false));
+        let error = input_error(open(&path).unwrap().read_level_set(selector, false));
         assert!(error.contains(reason), "{name}: {error}");
     }
     for (name, reason) in [("not_a_vdb_symlink_text.vdb", "symbolic link"), ("not_a_vdb_lfs_pointer.vdb", "Git LFS")] {
         let Some(path) = shared(name) else { continue };
-        assert!(input_error(vdb::open(&path)).contains(reason));
+        assert!(input_error(open(&path)).contains(reason));
         assert!(input_error(vdb::list(&path)).contains(reason));
     }
 }
@@ -141,12 +145,12 @@ fn real_files_without_a_level_set_are_refused_for_their_reason() {
 #[test]
 fn an_assumed_level_set_is_judged_by_its_band() {
     if let Some(path) = shared("box_active_tiles.vdb") {
-        let read = vdb::open(&path).unwrap().read_level_set(None, true).unwrap();
+        let read = open(&path).unwrap().read_level_set(None, true).unwrap();
         assert_eq!(read.facts.active_tiles, 1728);
         assert!(matches!(read.band, Band::Rebuild { .. }), "{:?}", read.band);
     }
     if let Some(path) = shared("empty_tree.vdb") {
-        let read = vdb::open(&path).unwrap().read_level_set(None, true).unwrap();
+        let read = open(&path).unwrap().read_level_set(None, true).unwrap();
         assert!(read.level_set.is_empty());
     }
 }
@@ -168,13 +172,13 @@ fn every_grid_of_every_real_file_passes_through_an_edit() {
         "velocity_vec3s.vdb",
     ] {
         let Some(path) = shared(name) else { continue };
-        let file = vdb::open(&path).unwrap();
+        let file = open(&path).unwrap();
         let listed = vdb::list(&path).unwrap();
         assert_same_except(&listed, file.listing(), None);
 
         let out = folder.path().join(name);
         vdb::write(&out, &[result(&added)], Some(&file), &WriteOptions::default()).unwrap();
-        let back = vdb::open(&out).unwrap();
+        let back = open(&out).unwrap();
         let mut after = back.listing().clone();
         assert_eq!(after.grids.pop().map(|g| g.name).as_deref(), Some("surface"), "{name}");
         assert_same_except(file.listing(), &after, None);
@@ -196,12 +200,12 @@ fn assert_cuts_are_errors(bytes: &[u8], what: &str) {
     let lengths = (0..bytes.len()).filter(|n| *n < 700 || bytes.len() - n < 40 || n % 997 == 0);
     for length in lengths {
         std::fs::write(&cut, &bytes[..length]).unwrap();
-        let error = input_error(vdb::open(&cut));
+        let error = input_error(open(&cut));
         assert!(error.contains("truncated") || error.contains("empty"), "{what} {length}: {error}");
         input_error(vdb::list(&cut));
     }
     std::fs::write(&cut, [bytes, &[0]].concat()).unwrap();
-    assert!(input_error(vdb::open(&cut)).contains("1 bytes follow"), "{what}");
+    assert!(input_error(open(&cut)).contains("1 bytes follow"), "{what}");
 }
 
 #[test]
@@ -223,11 +227,11 @@ fn zip_is_for_other_grids_than_level_sets() {
     let Some(path) = shared("velocity_vec3s.vdb") else { return };
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("zip.vdb");
-    let (file, level_set) = (vdb::open(path).unwrap(), sphere(Transform::uniform(0.1), 4.0));
+    let (file, level_set) = (open(path).unwrap(), sphere(Transform::uniform(0.1), 4.0));
     let zip = WriteOptions { compression: Some(Compression::Zip), ..WriteOptions::default() };
     let report = vdb::write(&out, &[result(&level_set)], Some(&file), &zip).unwrap();
     assert!(report.warnings[0].contains("does not zip level sets"));
-    let back = vdb::open(&out).unwrap();
+    let back = open(&out).unwrap();
     assert_eq!(back.listing().grids[0].compression, Compression::Zip);
     assert_eq!(back.listing().grids[1].compression, Compression::None);
     assert_eq!(back.fingerprint(0).unwrap(), file.fingerprint(0).unwrap());
@@ -252,7 +256,7 @@ fn real_files_cut_short_are_errors() {
         let bytes = std::fs::read(path).unwrap();
         for length in (0..12).map(|i| bytes.len() * i / 12 + 13).chain([bytes.len() - 1]) {
             std::fs::write(&cut, &bytes[..length]).unwrap();
-            let error = input_error(vdb::open(&cut));
+            let error = input_error(open(&cut));
             assert!(error.contains("truncated"), "{name} {length}: {error}");
         }
     }
@@ -277,7 +281,7 @@ fn what_is_written_reads_back_bit_for_bit() {
         assert!(level_set.grid().inside_tiles().iter().any(|(_, edge)| *edge == 128));
         let report = vdb::write(&path, &[result(&level_set)], None, &WriteOptions::default()).unwrap();
         assert_eq!(report.bytes, std::fs::metadata(&path).unwrap().len());
-        let back = vdb::open(&path).unwrap();
+        let back = open(&path).unwrap();
         let read = back.read_level_set(Some("surface"), false).unwrap();
         assert_same_grid(level_set.grid(), read.level_set.grid());
         assert_eq!(read.level_set.transform().to_world(), affine);
@@ -300,7 +304,7 @@ fn half_precision_rounds_and_is_kept() {
     let level_set = sphere(Transform::uniform(0.1), 20.0);
     let half = WriteOptions { precision: Some(Precision::Half), ..WriteOptions::default() };
     vdb::write(&path, &[result(&level_set)], None, &half).unwrap();
-    let file = vdb::open(&path).unwrap();
+    let file = open(&path).unwrap();
     assert_eq!(file.listing().grids[0].precision, Precision::Half);
     let read = file.read_level_set(None, false).unwrap();
     assert_eq!(read.band, Band::Regular, "{:?}", read.facts);
@@ -313,7 +317,7 @@ fn half_precision_rounds_and_is_kept() {
     let again = folder.path().join("again.vdb");
     let grid = GridToWrite { level_set: &read.level_set, name: None, replaces: Some(0) };
     vdb::write(&again, &[grid], Some(&file), &WriteOptions::default()).unwrap();
-    let kept = vdb::open(&again).unwrap();
+    let kept = open(&again).unwrap();
     assert_eq!(kept.listing().grids[0].precision, Precision::Half);
     assert_eq!(kept.fingerprint(0).unwrap(), file.fingerprint(0).unwrap());
 }
@@ -325,7 +329,7 @@ fn grids_of_one_name_are_told_apart() {
     let spheres = [5.0, 7.0, 9.0].map(|r| sphere(Transform::uniform(0.1), r));
     let grids: Vec<_> = spheres.iter().map(|s| GridToWrite { level_set: s, name: Some("s"), replaces: None }).collect();
     vdb::write(&path, &grids, None, &WriteOptions::default()).unwrap();
-    let file = vdb::open(&path).unwrap();
+    let file = open(&path).unwrap();
     for (n, wanted) in spheres.iter().enumerate() {
         let read = file.read_level_set(Some(&format!("s[{n}]")), false).unwrap();
         assert_eq!(read.index, n);
@@ -335,7 +339,7 @@ fn grids_of_one_name_are_told_apart() {
     let small = sphere(Transform::uniform(0.1), 3.0);
     let edit = GridToWrite { level_set: &small, name: None, replaces: Some(1) };
     vdb::write(&path, &[edit], Some(&file), &WriteOptions::default()).unwrap();
-    let back = vdb::open(&path).unwrap();
+    let back = open(&path).unwrap();
     assert_same_grid(back.read_level_set(Some("s[1]"), false).unwrap().level_set.grid(), small.grid());
     assert_eq!(back.fingerprint(0).unwrap(), file.fingerprint(0).unwrap());
     assert_eq!(back.fingerprint(2).unwrap(), file.fingerprint(2).unwrap());
@@ -379,9 +383,77 @@ fn a_link_keeps_pointing_and_permissions_stay() {
 #[test]
 fn bad_paths_are_input_errors() {
     let folder = tempfile::tempdir().unwrap();
-    assert!(input_error(vdb::open(folder.path())).contains("directory"));
-    assert!(input_error(vdb::open(folder.path().join("none.vdb"))).contains("cannot be opened"));
+    assert!(input_error(open(folder.path())).contains("directory"));
+    assert!(input_error(open(folder.path().join("none.vdb"))).contains("cannot be opened"));
     let empty = folder.path().join("empty.vdb");
     std::fs::write(&empty, "").unwrap();
     assert!(input_error(vdb::list(&empty)).contains("empty"));
+}
+
+#[test]
+fn a_file_over_the_memory_limit_is_refused_before_it_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.vdb");
+    let level_set = sphere(Transform::uniform(0.1), 20.0);
+    vdb::write(&path, &[result(&level_set)], None, &WriteOptions::default()).unwrap();
+    let limited = |bytes| {
+        let mut run = RunOptions::default();
+        run.memory_limit = Some(bytes);
+        vdb::open(&path, &run)
+    };
+    assert!(matches!(limited(100_000), Err(EditError::Memory { .. })));
+    assert!(limited(100_000_000).is_ok());
+}
+
+#[cfg(unix)]
+#[test]
+fn pipes_are_read_and_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let (pipe, copy) = (folder.path().join("pipe"), folder.path().join("copy.vdb"));
+    if !std::process::Command::new("mkfifo").arg(&pipe).status().is_ok_and(|s| s.success()) {
+        println!("skipped: mkfifo is not there");
+        return;
+    }
+    let level_set = sphere(Transform::uniform(0.1), 12.0);
+    std::thread::scope(|scope| {
+        scope.spawn(|| vdb::write(&pipe, &[result(&level_set)], None, &WriteOptions::default()).unwrap());
+        let piped = open(&pipe).unwrap();
+        assert_same_grid(piped.read_level_set(None, false).unwrap().level_set.grid(), level_set.grid());
+        vdb::write(&copy, &[], Some(&piped), &WriteOptions::default()).unwrap();
+        // What went through the pipe can be read grid by grid like any file.
+        assert!(piped.listing().has_offsets && vdb::list(&copy).unwrap().has_offsets);
+    });
+}
+
+/// A band with all of the interior active, as Houdini makes it on request.
+fn filled(radius: f64) -> LevelSet {
+    let reach = IVec3::splat(radius as i32 + 8);
+    let transform = Transform::uniform(0.1);
+    // A half width as wide as the solid makes every voxel of it active.
+    let wide = radius as f32 + 2.0;
+    let distance = |p: DVec3| p.length() - radius;
+    let solid = LevelSet::from_distance(transform, wide, (-reach, reach), distance, &RunOptions::default()).unwrap();
+    let source = solid.grid();
+    let origins: Vec<IVec3> = source.leaves().iter().map(|&id| source.origin(id)).collect();
+    let mut grid = Grid::from_origins(0.3, &origins);
+    grid.update_all(|id, values, mask| {
+        // Fresh grids of the same leaves have the same slots.
+        values.clone_from(source.values(id));
+        for (offset, value) in values.0.iter_mut().enumerate() {
+            mask.set(offset, *value < 0.3);
+            *value = value.min(0.3);
+        }
+    });
+    LevelSet::new(grid, transform)
+}
+
+#[test]
+fn a_filled_interior_is_found_and_measured() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("filled.vdb");
+    vdb::write(&path, &[result(&filled(12.0))], None, &WriteOptions::default()).unwrap();
+    let read = open(&path).unwrap().read_level_set(None, false).unwrap();
+    let Band::Trim { inner, outer } = read.band else { panic!("{:?}", read.band) };
+    assert!((inner - 1.2).abs() < 1e-6 && (outer - 0.3).abs() < 1e-6, "{inner} {outer}");
+    assert!(read.facts.inactive_inside.is_empty());
 }

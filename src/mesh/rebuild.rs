@@ -10,7 +10,7 @@ use glam::{DVec3, IVec3};
 use super::scatter::{distance_to_triangles, estimated_bytes};
 use super::{Bvh, MeshToLevelSet, TriangleMesh, level_set_to_mesh, mesh_to_level_set};
 use crate::error::{EditError, Result};
-use crate::grid::{LEAF_VOXELS, LeafMask, Transform, leaf_offset, leaf_origin, offset_to_local};
+use crate::grid::{LEAF_VOXELS, LeafMask, Transform};
 use crate::levelset::{LevelSet, background, grid_of_leaves};
 use crate::run::RunOptions;
 

@@ -6,10 +6,14 @@
 
 pub mod compare;
 pub mod csg;
+pub mod distance;
+pub mod morphology;
 mod params;
 mod registry;
+pub mod shape;
 pub mod smooth;
 mod solver;
+pub mod transform;
 
 pub use params::{Vector, VoxelLength, WorldLength};
 pub use registry::{Arity, Entry, Operator, Outcome, Parameter, REGISTRY, Summary, find};

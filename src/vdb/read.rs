@@ -15,6 +15,7 @@ use super::structure::{START_BYTES, check_start};
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, LEAF_DIM, MAX_COORD};
 use crate::levelset::LevelSet;
+use crate::run::RunOptions;
 
 /// Stands for standard input and output.
 pub(super) const PIPE: &str = "-";
@@ -47,9 +48,16 @@ pub struct ReadLevelSet {
     pub facts: BandFacts,
 }
 
-/// Reads a whole file. `-` is standard input.
-pub fn open(path: impl AsRef<Path>) -> Result<VdbFile> {
+/// Reads a whole file. `-` is standard input. Refused before reading if the file itself says that its grids need more than
+/// the memory limit of `run`.
+pub fn open(path: impl AsRef<Path>, run: &RunOptions) -> Result<VdbFile> {
     let path = path.as_ref();
+    run.check("reading")?;
+    if run.memory_limit.is_some() && path.is_file() {
+        let listing = list(path)?;
+        let needed = listing.grids.iter().filter_map(|g| g.meta("file_mem_bytes")?.parse::<u64>().ok()).sum();
+        run.reserve("reading", needed, "take a file with fewer or smaller grids")?;
+    }
     let archive = open_archive(path, false)?;
     let listing = FileListing::of(&archive).map_err(|e| EditError::input(path, e.what()))?;
     Ok(VdbFile { archive, listing, path: path.into() })
