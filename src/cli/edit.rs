@@ -77,9 +77,19 @@ pub struct Edit {
 }
 
 impl Edit {
+    /// What the result is compared with: the first input, but for a conversion only if it was a level set already.
+    fn before(&self) -> Option<&LevelSet> {
+        let input = self.inputs.first()?;
+        (self.converts_nothing() || input.source.is_some()).then_some(&input.level_set)
+    }
+
+    fn converts_nothing(&self) -> bool {
+        self.operation != super::convert::VERB.name
+    }
+
     /// Verifies, draws and writes the result, then tells what changed.
     pub fn finish(self, output: &Output, preview: &Preview, check: bool, context: &Context) -> Result<()> {
-        let before = self.inputs.first().map(|input| &input.level_set);
+        let before = self.before();
         let facts = Facts {
             before: before.map(|level_set| level_set.measure(&context.run)).transpose()?,
             after: self.level_set.measure(&context.run)?,
@@ -176,43 +186,42 @@ impl Report<'_> {
             edit.operation,
             edit.began.elapsed().as_secs_f64()
         );
+        // A conversion that changed nothing needs no second column.
+        let before = before.as_ref().filter(|before| *voxels_changed > 0 || *before != after);
         let row = |name: &str, of: fn(&Measures) -> f64| {
             let mut row = vec![name.to_owned()];
-            if let Some(before) = before {
-                row.push(table::number(of(before)));
-            }
+            row.extend(before.map(|before| table::number(of(before))));
             row.push(table::number(of(after)));
-            row.extend(before.as_ref().map(|before| table::change(of(before), of(after))));
+            row.extend(before.map(|before| table::change(of(before), of(after))));
             row
         };
         let whole = |name: &str, of: fn(&Measures) -> i64| {
             let mut row = vec![name.to_owned()];
-            row.extend(before.as_ref().map(|before| of(before).to_string()));
+            row.extend(before.map(|before| of(before).to_string()));
             row.push(of(after).to_string());
             row
         };
-        let heading = match before {
-            Some(_) => vec![String::new(), "before".into(), "after".into(), "change".into()],
-            None => Vec::new(),
-        };
+        let heading = before.map(|_| ["", "before", "after", "change"].map(str::to_owned).to_vec());
         let rows = [
-            heading,
             row("volume (world units³)", |m| m.volume),
             row("area (world units²)", |m| m.area),
             whole("components", |m| m.components as i64),
             whole("Euler number", |m| m.euler),
         ];
-        text += &table::columns(rows.into_iter().filter(|row| !row.is_empty()));
-        let active = edit.level_set.grid().active_voxels();
+        text += &table::columns(heading.into_iter().chain(rows));
+        let changed = match voxels_changed {
+            0 => "no voxel changed".into(),
+            n => format!("{} voxels changed", table::count(*n)),
+        };
         text += &format!(
-            "  {} of {} active voxels changed; a voxel is {} world units\n",
-            table::count(*voxels_changed),
-            table::count(active),
+            "  {changed}; {} active voxels of {} world units\n",
+            table::count(edit.level_set.grid().active_voxels()),
             table::number(edit.level_set.voxel_size())
         );
         if let Some(steps) = summary.steps {
             let reason = summary.stopped_because.as_ref().map(|reason| format!(": {reason}")).unwrap_or_default();
-            text += &format!("  {steps} steps{reason}\n");
+            let plural = if steps == 1 { "" } else { "s" };
+            text += &format!("  {steps} step{plural}{reason}\n");
         }
         for (name, value) in &summary.details {
             text += &format!("  {}: {value}\n", name.replace('_', " "));

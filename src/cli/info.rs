@@ -62,7 +62,7 @@ struct Found {
 
 fn examine(path: &Path, options: &InputOptions, context: &Context) -> Result<Found> {
     if input::is_volume(path) {
-        let description = volume::describe(path, options.choice(0))?;
+        let description = volume::describe(path, options.choice(0), &context.run)?;
         examine_volume(path, description, context)
     } else {
         examine_mesh(path)
@@ -185,6 +185,9 @@ fn level_set_json(facts: &LevelSetFacts) -> Value {
     })
 }
 
+/// Metadata that only repeats what the other lines say, as does everything that begins with `file_`.
+const SAID_ABOVE: [&str; 3] = ["class", "name", "is_saved_as_half_float"];
+
 fn grid_text(grid: &GridDescription, facts: Option<&LevelSetFacts>) -> String {
     let size = grid.voxel_size;
     let cube = voxel_size_json(size).is_number();
@@ -212,7 +215,8 @@ fn grid_text(grid: &GridDescription, facts: Option<&LevelSetFacts>) -> String {
         rows.push(("components", format!("{} ({} of the surface)", measures.components, measures.surface_components)));
         rows.push(("Euler number", measures.euler.to_string()));
     }
-    for (name, value) in &grid.metadata {
+    let said = |name: &str| name.starts_with("file_") || SAID_ABOVE.contains(&name);
+    for (name, value) in grid.metadata.iter().filter(|(name, _)| !said(name)) {
         rows.push((name, value.as_str().map_or_else(|| value.to_string(), str::to_owned)));
     }
     match &grid.level_set {

@@ -180,7 +180,7 @@ pub fn load(
     for path in paths {
         context.run.check("reading")?;
         if is_volume(path) {
-            let volume = volume::open(path)?;
+            let volume = volume::open(path, &context.run)?;
             warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
             let grid = volume.read(options.choice(volumes))?;
             volumes += 1;

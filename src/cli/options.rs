@@ -60,7 +60,7 @@ const SEQUENCES: &[Sequence] = &[
         options: &[
             option("scale", "scale ", "FACTOR", Some("Scale by this factor")),
             option("rotate", "rotate ", "AXIS,DEGREES", Some("Rotate: `y,90`, or a quaternion `x,y,z,w`")),
-            option("translate", "translate ", "X,Y,Z", Some("Move, in world units (or `3vx,0,0`)")),
+            option("translate", "translate ", "X,Y,Z", Some("Move, in world units")),
             option("mirror", "mirror ", "AXIS", Some("Mirror along x, y or z")),
         ],
     },
@@ -116,7 +116,7 @@ fn option_of(parameter: &Parameter) -> Arg {
             .default_missing_value("true")
             .hide_possible_values(true),
         // The words are shown as possible values.
-        Kind::Words(_) => arg,
+        Kind::Words(_) => arg.value_name(parameter.name.to_uppercase()),
         _ => arg.value_name(kind.value_name(parameter)).allow_hyphen_values(kind.may_be_negative()),
     };
     let arg = if parameter.is_list { arg.action(ArgAction::Append) } else { arg };

@@ -23,18 +23,25 @@ pub fn pairs<'a>(rows: impl IntoIterator<Item = (&'a str, String)>) -> String {
     rows.iter().map(|(name, value)| format!("  {name:width$}  {value}\n")).collect()
 }
 
-/// A number with five significant digits.
+/// A number with five significant digits, zeros at its end left out.
 pub fn number(value: f64) -> String {
     if value == 0.0 || !value.is_finite() {
         return value.to_string();
     }
-    let exponent = value.abs().log10().floor() as i32;
-    match exponent {
-        -4..=-1 => format!("{value:.*}", (4 - exponent) as usize),
-        0..=4 => format!("{value:.*}", (4 - exponent) as usize),
-        5..=14 => format!("{value:.0}"),
-        _ => format!("{value:.4e}"),
-    }
+    // Rounded first, so that 9.99996 counts as 10.
+    let rounded = format!("{value:.4e}");
+    let (digits, exponent) = rounded.split_once('e').unwrap_or((&rounded, "0"));
+    let exponent: i32 = exponent.parse().unwrap_or(0);
+    let text = match exponent {
+        -4..=4 => format!("{value:.*}", (4 - exponent) as usize),
+        5..=14 => return format!("{value:.0}"),
+        _ => return format!("{}e{exponent}", without_zeros(digits)),
+    };
+    without_zeros(&text).to_owned()
+}
+
+fn without_zeros(text: &str) -> &str {
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { text }
 }
 
 /// A whole number with its digits in groups of three.
@@ -67,12 +74,15 @@ mod tests {
     fn numbers_have_five_digits() {
         for (value, text) in [
             (0.0, "0"),
-            (1.0, "1.0000"),
+            (1.0, "1"),
+            (0.01 - 1e-17, "0.01"),
+            (9.99996, "10"),
+            (12345.6, "12346"),
             (-12.34567, "-12.346"),
             (0.00123456, "0.0012346"),
             (123456.7, "123457"),
-            (1e-9, "1.0000e-9"),
-            (2.5e20, "2.5000e20"),
+            (1e-9, "1e-9"),
+            (2.5e20, "2.5e20"),
         ] {
             assert_eq!(number(value), text);
         }

@@ -8,6 +8,7 @@ use serde_json::{Map, Value, json};
 use super::output::VolumeOptions;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
+use crate::run::RunOptions;
 use crate::vdb::{
     Band, Compression, GridListing, GridToWrite, MetaItem, Precision, ReadLevelSet, VdbFile, WriteOptions,
 };
@@ -50,8 +51,8 @@ pub struct Choice<'a> {
 }
 
 /// Opens a file; `-` is standard input.
-pub fn open(path: &Path) -> Result<Volume> {
-    Ok(Volume { file: crate::vdb::open(path)? })
+pub fn open(path: &Path, run: &RunOptions) -> Result<Volume> {
+    Ok(Volume { file: crate::vdb::open(path, run)? })
 }
 
 /// Finds out without loading voxels whether the chosen level set is there; returns how it is selected.
@@ -153,8 +154,8 @@ pub struct GridDescription {
 }
 
 /// Describes a file, or one grid of it.
-pub fn describe(path: &Path, choice: Choice) -> Result<Description> {
-    let volume = open(path)?;
+pub fn describe(path: &Path, choice: Choice, run: &RunOptions) -> Result<Description> {
+    let volume = open(path, run)?;
     let listing = volume.file.listing();
     let chosen = match choice.grid {
         Some(selector) => Some(listing.find(selector).map_err(|problem| EditError::input(path, problem))?),

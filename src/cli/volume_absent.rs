@@ -9,6 +9,7 @@ use serde_json::{Map, Value};
 use super::output::VolumeOptions;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
+use crate::run::RunOptions;
 
 const ABSENT: &str = "this vdb-edit was built without OpenVDB; build it with the feature `openvdb`";
 
@@ -40,7 +41,7 @@ pub struct Choice<'a> {
 }
 
 /// Refuses.
-pub fn open(path: &Path) -> Result<Volume> {
+pub fn open(path: &Path, _: &RunOptions) -> Result<Volume> {
     Err(EditError::input(path, ABSENT))
 }
 
@@ -91,6 +92,6 @@ pub struct GridDescription {
 }
 
 /// Refuses.
-pub fn describe(path: &Path, _: Choice) -> Result<Description> {
+pub fn describe(path: &Path, _: Choice, _: &RunOptions) -> Result<Description> {
     Err(EditError::input(path, ABSENT))
 }
