@@ -3,6 +3,8 @@
 #![warn(missing_docs)]
 
 pub mod atomic;
+#[cfg(feature = "cli")]
+pub mod cli;
 pub mod error;
 pub mod grid;
 pub mod levelset;

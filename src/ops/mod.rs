@@ -4,6 +4,7 @@
 //! library's argument, the options of the command and the keys of a recipe; its field documentation is the help. The
 //! command line and recipes find operators in [`REGISTRY`] and know nothing of any one of them.
 
+pub mod compare;
 pub mod csg;
 pub mod distance;
 pub mod morphology;

@@ -3,6 +3,7 @@
 use glam::{DAffine3, DMat3, DVec3, IVec3};
 
 use super::bridge::ffi;
+use super::select;
 use crate::grid::Transform;
 
 /// One item of a file's or a grid's metadata.
@@ -161,6 +162,17 @@ pub struct FileListing {
 }
 
 impl FileListing {
+    /// The place of the grid that `selector` names, of whatever kind; otherwise the reason.
+    pub fn find(&self, selector: &str) -> Result<usize, String> {
+        select::named(&self.grids, selector)
+    }
+
+    /// The place of the grid that [`VdbFile::select_level_set`](super::VdbFile::select_level_set) would choose; otherwise the
+    /// reason why there is none.
+    pub fn select_level_set(&self, selector: Option<&str>, assume_level_set: bool) -> Result<usize, String> {
+        select::select_level_set(&self.grids, selector, assume_level_set)
+    }
+
     pub(super) fn of(archive: &ffi::Archive) -> Result<Self, cxx::Exception> {
         let header = archive.header()?;
         let mut grids = (0..archive.grid_count())

@@ -19,7 +19,8 @@ pub(super) fn select_level_set(
     Ok(index)
 }
 
-fn named(grids: &[GridListing], selector: &str) -> Result<usize, String> {
+/// The grid that `selector` names, or the reason why there is none.
+pub(super) fn named(grids: &[GridListing], selector: &str) -> Result<usize, String> {
     let matches: Vec<usize> = (0..grids.len()).filter(|&i| grids[i].name == selector).collect();
     match matches[..] {
         [index] => return Ok(index),

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::bridge::ffi;
 use super::listing::{Compression, Precision};
 use super::read::{PIPE, VdbFile};
+use crate::atomic::Unfinished;
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, Transform};
 use crate::levelset::LevelSet;
@@ -215,6 +216,7 @@ impl Target<'_> {
         };
         let in_folder = format!("no file can be made in {}", folder.display());
         let temporary = new_file_in(&folder).map_err(self.io(&in_folder))?;
+        let _unfinished = Unfinished::new(temporary.path());
         let name = temporary.path().as_os_str().as_encoded_bytes();
         content.as_mut().write_path(name, compression).map_err(|e| self.error(e.what()))?;
         temporary.as_file().sync_all().map_err(self.io("flushing"))?;
