@@ -149,6 +149,11 @@ impl Grid {
         });
     }
 
+    /// Changes the masks of the leaves of `set`, in parallel.
+    pub fn update_masks(&mut self, set: &LeafSet, f: impl Fn(LeafId, &mut LeafMask) + Sync) {
+        self.masks.par_update(set, f);
+    }
+
     /// Changes the values and masks of all leaves, in parallel.
     pub fn update_all(&mut self, f: impl Fn(LeafId, &mut LeafValues, &mut LeafMask) + Sync) {
         let set = self.leaf_set().clone();
@@ -198,6 +203,19 @@ impl Grid {
             Arc::make_mut(&mut self.topology).remove(&removed);
         }
         removed.into_iter().map(|(id, _)| id).collect()
+    }
+
+    /// Removes leaves, whatever they hold; the space takes the sign `inside`.
+    pub fn remove_leaves(&mut self, leaves: &[LeafId], inside: bool) {
+        let removed: Vec<_> = leaves.iter().map(|&id| (id, LeafId::sentinel(inside))).collect();
+        if !removed.is_empty() {
+            Arc::make_mut(&mut self.topology).remove(&removed);
+        }
+    }
+
+    /// Where neither this grid nor `other` has a leaf, the sign becomes `sign(inside here, inside there)`.
+    pub fn combine_signs(&mut self, other: &Self, sign: impl Fn(bool, bool) -> bool) {
+        Arc::make_mut(&mut self.topology).combine_signs(&other.topology, sign);
     }
 
     /// Gives all absent leaves in the box of voxels `lo..hi` (multiples of 8, `hi` excluded) a sign.

@@ -271,6 +271,33 @@ impl Topology {
         self.neighbours = OnceLock::new();
     }
 
+    /// Where both this and `other` have no leaf, the sign becomes `sign(inside here, inside there)`. Entries that are leaves stay.
+    pub fn combine_signs(&mut self, other: &Self, sign: impl Fn(bool, bool) -> bool) {
+        let combine = |mine: LeafId, theirs: LeafId| {
+            if mine.is_sentinel() && theirs.is_sentinel() {
+                LeafId::sentinel(sign(mine == LeafId::INSIDE, theirs == LeafId::INSIDE))
+            } else {
+                mine
+            }
+        };
+        let missing: Vec<IVec3> = other.nodes.keys().copied().filter(|n| !self.nodes.contains_key(n)).collect();
+        for node in missing {
+            self.nodes.insert(node, outside_table());
+        }
+        for (node, table) in &mut self.nodes {
+            let theirs = other.nodes.get(node);
+            let there = |i: usize| theirs.map_or(LeafId::OUTSIDE, |t| t[i]);
+            // A table is copied only if an entry of it changes.
+            if (0..NODE_ENTRIES).any(|i| combine(table[i], there(i)) != table[i]) {
+                let table = Arc::make_mut(table);
+                for (i, entry) in table.iter_mut().enumerate() {
+                    *entry = combine(*entry, there(i));
+                }
+            }
+        }
+        self.neighbours = OnceLock::new();
+    }
+
     /// Boxes of absent leaves that are inside, each as its first origin and its edge in voxels (8, or 128 for a whole node), by origin.
     pub fn inside_tiles(&self) -> Vec<(IVec3, i32)> {
         let mut tiles = Vec::new();

@@ -4,7 +4,9 @@
 //! ±background; background = half width · voxel size. `check` verifies these invariants.
 
 mod build;
+mod lattice;
 mod sample;
+pub mod shapes;
 
 use glam::{DVec3, IVec3};
 

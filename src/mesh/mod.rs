@@ -1,25 +1,30 @@
 //! Triangle meshes: files, and the way to a level set and back.
 
+mod build;
 mod bvh;
 mod closest;
-mod closure;
-mod crossings;
+mod color;
+pub mod files;
 mod findings;
-mod inside;
-mod intersect;
-mod pieces;
+mod gltf;
+mod gltf_write;
+mod obj;
+mod off;
+mod ply;
+mod polygon;
 mod prepare;
-mod scatter;
+mod stl;
 #[cfg(test)]
 mod testing;
-mod to_levelset;
+mod text;
+pub mod to_levelset;
 mod topology;
 mod winding;
 
 pub use bvh::{Bvh, Hit};
+pub use files::{MeshFormat, ReadMesh, read, write, write_to};
 pub use findings::MeshFindings;
-pub use prepare::{prepare, weld_equal};
-pub use scatter::{UnsignedLeaf, distance_to_triangles};
+pub use prepare::prepare;
 pub use to_levelset::{MeshToLevelSet, mesh_to_level_set};
 pub use topology::{Topology, analyze};
 pub use winding::WindingNumber;

@@ -45,7 +45,7 @@ pub fn prepare(mesh: &TriangleMesh) -> (TriangleMesh, MeshFindings) {
 }
 
 /// Lets every triangle use the first of the vertices that have equal coordinates. Returns how many vertices were joined.
-pub fn weld_equal(mesh: &mut TriangleMesh) -> usize {
+fn weld_equal(mesh: &mut TriangleMesh) -> usize {
     let mut first: FxHashMap<[u64; 3], u32> = FxHashMap::default();
     first.reserve(mesh.positions.len());
     let mut joined = 0;

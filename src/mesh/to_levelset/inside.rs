@@ -9,19 +9,19 @@ use std::f64::consts::PI;
 
 use glam::{DVec3, IVec3};
 
-use super::WindingNumber;
 use super::crossings::Crossings;
-use super::topology::{boundary_chain, edge_uses};
-use super::winding::BATCH;
 use crate::grid::{Face, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset, leaf_origin, offset_to_local};
+use crate::mesh::WindingNumber;
+use crate::mesh::topology::{boundary_chain, edge_uses};
+use crate::mesh::winding::BATCH;
 
 /// Half the diagonal of the lattice of a leaf's voxels, 3.5·√3, rounded up.
 const LEAF_RADIUS: f64 = 6.1;
 /// The error of fast winding numbers, doubled.
-pub(crate) const WINDING_ERROR: f64 = 0.02;
+pub(super) const WINDING_ERROR: f64 = 0.02;
 /// Neighbouring voxels whose distances to the triangles add up to more than their own distance are not separated.
 /// The excess covers the rounding of the distances.
-pub(crate) const APART: f32 = 1.0 + 1e-5;
+pub(super) const APART: f32 = 1.0 + 1e-5;
 
 /// Edges in a group of the rim.
 const RIM_GROUP: usize = 32;
@@ -35,7 +35,7 @@ struct Current {
 }
 
 /// The boundary of a mesh, and how fast the winding number can change because of it.
-pub(crate) struct Rim {
+pub(super) struct Rim {
     groups: Vec<(Current, Vec<Current>)>,
 }
 
@@ -79,7 +79,7 @@ impl Rim {
 }
 
 /// Tells inside from outside, leaf by leaf.
-pub(crate) enum Inside<'a> {
+pub(super) enum Inside<'a> {
     /// Of a mesh without boundary: where the integer winding number is positive.
     Closed(Crossings),
     /// Of any mesh.
@@ -97,7 +97,7 @@ impl Inside<'_> {
 }
 
 /// Inside by winding number.
-pub(crate) struct OpenInside<'a> {
+pub(super) struct OpenInside<'a> {
     pub winding: &'a WindingNumber<'a>,
     pub rim: &'a Rim,
 }
@@ -160,8 +160,8 @@ impl OpenInside<'_> {
 mod tests {
     use super::*;
     use crate::mesh::Bvh;
-    use crate::mesh::scatter::distance_to_triangles;
     use crate::mesh::testing::*;
+    use crate::mesh::to_levelset::scatter::distance_to_triangles;
     use crate::run::RunOptions;
 
     #[test]

@@ -1,22 +1,31 @@
 //! Triangle mesh → narrow-band level set.
 //!
-//! The mesh is cleaned and oriented ([`prepare`](super::prepare)); distances are exact to its triangles. The sign of a closed mesh is that
+//! The mesh is cleaned and oriented ([`prepare`]); distances are exact to its triangles. The sign of a closed mesh is that
 //! of its integer winding number: inside where it is 1 or more, so that overlapping shells are united and shells that
 //! face inwards within others are cavities. Any other mesh is inside where its generalised winding number is above ½.
 //!
 //! Where shells overlap or the mesh is open, distances are to the *repaired* surface: pieces of triangles with the same inside or
-//! outside on both sides are left out ([`pieces`](super::pieces)), and the ½ level of the winding number is put in where the sign changes
-//! without a triangle ([`closure`](super::closure)). So the result is a valid level set whatever came in, and [`MeshFindings`] says what was done.
+//! outside on both sides are left out (`pieces`), and the ½ level of the winding number is put in where the sign changes
+//! without a triangle (`closure`). So the result is a valid level set whatever came in, and [`MeshFindings`] says what was done.
+
+mod closure;
+mod crossings;
+mod inside;
+mod intersect;
+mod pieces;
+mod scatter;
 
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::closure::{DistanceLeaves, Surroundings};
-use super::crossings::Crossings;
-use super::inside::{Inside, OpenInside, Rim};
-use super::pieces::separating_pieces;
+use closure::{DistanceLeaves, Surroundings};
+use crossings::Crossings;
+use inside::{Inside, OpenInside, Rim};
+use pieces::separating_pieces;
+use scatter::estimated_bytes;
+pub use scatter::{UnsignedLeaf, distance_to_triangles};
+
 use super::prepare::prepare;
-use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes};
 use super::topology::{boundary_chain, edge_uses};
 use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber};
 use crate::error::{EditError, Result};

@@ -13,8 +13,8 @@ use rustc_hash::FxHashMap;
 
 use super::inside::{Rim, WINDING_ERROR};
 use super::intersect::intersecting;
-use super::winding::BATCH;
-use super::{Bvh, WindingNumber};
+use crate::mesh::winding::BATCH;
+use crate::mesh::{Bvh, WindingNumber};
 
 /// Longest edge, in voxels, of the pieces that are judged first.
 const COARSE: f64 = 2.0;
@@ -25,7 +25,7 @@ const FINE: f64 = 0.25;
 const BESIDE: f64 = 1e-3;
 
 /// What remains of a surface.
-pub(crate) struct Pieces {
+pub(super) struct Pieces {
     /// The pieces that count.
     pub kept: Vec<[DVec3; 3]>,
     /// Fraction of the area that does not.
@@ -33,7 +33,7 @@ pub(crate) struct Pieces {
 }
 
 /// Cuts and judges the triangles of an indexed mesh in index space.
-pub(crate) fn separating_pieces(
+pub(super) fn separating_pieces(
     positions: &[DVec3],
     triangles: &[[u32; 3]],
     bvh: &Bvh,

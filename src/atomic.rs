@@ -1,0 +1,209 @@
+//! Files that appear whole or not at all.
+//!
+//! The new content goes to a temporary file in the target's folder, is flushed to the disk and then renamed over the
+//! target, which POSIX and Windows do atomically. Whatever fails before the rename leaves the old file as it was and
+//! the temporary file is removed. A target that is a symbolic link is followed, so the link stays and the file behind
+//! it is replaced.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use tempfile::NamedTempFile;
+
+use crate::{EditError, Result};
+
+/// As many links as Linux follows before it calls them a loop.
+const MAX_LINKS: usize = 40;
+
+/// Replaces `path` by what `write` produces, or leaves it alone.
+///
+/// The writer is buffered. An [`EditError`] that `write` wraps by [`io::Error::other`] (a cancellation, say) comes back
+/// as it was; every other failure is an [`EditError::Output`]. Devices and pipes cannot be renamed over: they are
+/// written to directly.
+pub fn write_atomically(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<()> {
+    // Asked of the path as given: links like /dev/stdout may lead to names that only the kernel can follow.
+    if fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+        let device = File::options().write(true).open(path).map_err(|e| failed(path, e))?;
+        let mut buffered = BufWriter::new(device);
+        return write(&mut buffered).and_then(|()| buffered.flush()).map_err(|e| failed(path, e));
+    }
+    replace(path, &final_target(path)?, |file| {
+        let mut buffered = BufWriter::with_capacity(1 << 16, file.as_file_mut());
+        write(&mut buffered).and_then(|()| buffered.flush()).map_err(|e| failed(path, e))
+    })
+}
+
+/// Replaces `path` by the file that `produce` fills, for libraries that want a path and not a writer.
+///
+/// `produce` gets the path of an empty temporary file, in the target's folder and with its extension. It may read the
+/// file back before it returns: only then is it renamed.
+pub fn replace_atomically(path: &Path, produce: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+    let target = final_target(path)?;
+    replace(path, &target, |file| produce(file.path()))
+}
+
+/// The steps that both faces share: refuse early, create, fill, flush, rename.
+fn replace(path: &Path, target: &Path, fill: impl FnOnce(&mut NamedTempFile) -> Result<()>) -> Result<()> {
+    let existing = match fs::metadata(target) {
+        Ok(metadata) if metadata.is_dir() => return Err(EditError::output(path, "it is a folder, not a file")),
+        Ok(metadata) if !metadata.is_file() => {
+            return Err(EditError::output(path, "it is a device or a pipe; a regular file would work"));
+        }
+        Ok(metadata) if metadata.permissions().readonly() => {
+            return Err(EditError::output(path, "the existing file is read-only"));
+        }
+        Ok(metadata) => Some(metadata.permissions()),
+        Err(_) => None,
+    };
+    let folder = folder_of(target);
+    let suffix = target.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".vdb-edit-").suffix(&suffix);
+    // Temporary files are private (0600) by default; a result should be as readable as any file the user creates.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let mut file = builder.tempfile_in(folder).map_err(|e| failed(path, e))?;
+    fill(&mut file)?;
+    // Reopened by name: `produce` may have replaced the file by another one.
+    let flushed = File::open(file.path()).and_then(|f| f.sync_all());
+    flushed.map_err(|e| failed(path, e))?;
+    if let Some(permissions) = existing {
+        fs::set_permissions(file.path(), permissions).map_err(|e| failed(path, e))?;
+    }
+    file.into_temp_path().persist(target).map_err(|e| failed(path, e.error))?;
+    // The rename itself is durable once the folder is; not every file system lets a folder be synchronised.
+    #[cfg(unix)]
+    if let Ok(folder) = File::open(folder) {
+        let _ = folder.sync_all();
+    }
+    Ok(())
+}
+
+fn folder_of(target: &Path) -> &Path {
+    match target.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    }
+}
+
+/// The file behind a chain of symbolic links; it need not exist yet.
+fn final_target(path: &Path) -> Result<PathBuf> {
+    if path.file_name().is_none() {
+        return Err(EditError::output(path, "it is a folder, not a file"));
+    }
+    let mut target = path.to_path_buf();
+    for _ in 0..MAX_LINKS {
+        match fs::symlink_metadata(&target) {
+            Ok(metadata) if metadata.is_symlink() => {
+                let link = fs::read_link(&target).map_err(|e| failed(path, e))?;
+                target = folder_of(&target).join(link);
+            }
+            _ => return Ok(target),
+        }
+    }
+    Err(EditError::output(path, "its symbolic links form a loop"))
+}
+
+fn failed(path: &Path, error: io::Error) -> EditError {
+    error.downcast::<EditError>().unwrap_or_else(|e| EditError::output(path, e.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(folder: &Path) -> Vec<String> {
+        let mut names: Vec<_> =
+            fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn replaces_the_whole_content() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.txt");
+        fs::write(&path, "a much longer old content").unwrap();
+        write_atomically(&path, |w| w.write_all(b"new")).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"new");
+        replace_atomically(&path, |temporary| {
+            assert_eq!(temporary.extension(), path.extension());
+            fs::write(temporary, "newer").map_err(|e| EditError::output(temporary, e.to_string()))
+        })
+        .unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"newer");
+        assert_eq!(names(folder.path()), ["a.txt"]);
+    }
+
+    #[test]
+    fn a_failure_half_way_leaves_the_old_file_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.txt");
+        fs::write(&path, "old").unwrap();
+        let error = write_atomically(&path, |w| {
+            w.write_all(&[0; 1 << 20])?;
+            Err(io::Error::from(io::ErrorKind::StorageFull))
+        })
+        .unwrap_err();
+        assert!(matches!(error, EditError::Output { .. }), "{error}");
+        let cancelled = EditError::Cancelled { operation: "write".into() };
+        let error = write_atomically(&path, |_| Err(io::Error::other(cancelled))).unwrap_err();
+        assert!(matches!(error, EditError::Cancelled { .. }), "{error}");
+        assert_eq!(fs::read(&path).unwrap(), b"old");
+        assert_eq!(names(folder.path()), ["a.txt"]);
+    }
+
+    #[test]
+    fn folders_and_missing_folders_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        for path in [folder.path().to_path_buf(), folder.path().join("missing/a.txt"), PathBuf::from("/")] {
+            let error = write_atomically(&path, |_| Ok(())).unwrap_err();
+            assert!(matches!(error, EditError::Output { .. }), "{error}");
+        }
+        assert_eq!(names(folder.path()), Vec::<String>::new());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn permissions_of_the_old_file_are_kept_and_new_files_are_not_private() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+        let (new, plain) = (folder.path().join("new"), folder.path().join("plain"));
+        write_atomically(&new, |_| Ok(())).unwrap();
+        fs::write(&plain, "").unwrap();
+        assert_eq!(mode(&new), mode(&plain));
+        fs::set_permissions(&new, fs::Permissions::from_mode(0o640)).unwrap();
+        write_atomically(&new, |_| Ok(())).unwrap();
+        assert_eq!(mode(&new), 0o640);
+        fs::set_permissions(&new, fs::Permissions::from_mode(0o444)).unwrap();
+        assert!(write_atomically(&new, |_| Ok(())).unwrap_err().to_string().contains("read-only"));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_are_followed_and_stay_links() {
+        use std::os::unix::fs::symlink;
+        let folder = tempfile::tempdir().unwrap();
+        let (link, file) = (folder.path().join("link"), folder.path().join("file"));
+        symlink("file", &link).unwrap();
+        write_atomically(&link, |w| w.write_all(b"first")).unwrap();
+        write_atomically(&link, |w| w.write_all(b"second")).unwrap();
+        assert!(fs::symlink_metadata(&link).unwrap().is_symlink());
+        assert_eq!(fs::read(&file).unwrap(), b"second");
+        symlink("loop", folder.path().join("loop")).unwrap();
+        let error = write_atomically(&folder.path().join("loop"), |_| Ok(())).unwrap_err();
+        assert!(error.to_string().contains("loop"), "{error}");
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn devices_are_written_to_and_what_cannot_be_written_is_an_output_error() {
+        write_atomically(Path::new("/dev/null"), |w| w.write_all(b"x")).unwrap();
+        let error = write_atomically(Path::new("/proc/not-here.ply"), |w| w.write_all(b"x")).unwrap_err();
+        assert_eq!(error.exit_code(), 4, "{error}");
+        let error = write_atomically(Path::new("/dev/full"), |w| w.write_all(b"x")).unwrap_err();
+        assert_eq!(error.exit_code(), 4, "{error}");
+    }
+}

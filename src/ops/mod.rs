@@ -1,0 +1,14 @@
+//! The operators: one file each, and one registry that lists them all.
+//!
+//! An operator is a struct of parameters with plain public fields and a doc comment a field. That struct is the
+//! library's argument, the options of the command and the keys of a recipe; its field documentation is the help. The
+//! command line and recipes find operators in [`REGISTRY`] and know nothing of any one of them.
+
+mod params;
+mod registry;
+pub mod smooth;
+mod solver;
+
+pub use params::{Vector, VoxelLength, WorldLength};
+pub use registry::{Arity, Entry, Operator, Outcome, Parameter, REGISTRY, Summary, find};
+pub use solver::{EvolutionOptions, Like, RegionSpecs, Scheme};

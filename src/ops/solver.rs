@@ -1,0 +1,158 @@
+//! Options that the evolving operators share: how long, where, and how it is solved.
+
+use std::borrow::Cow;
+
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use serde::{Deserialize, Deserializer, Serialize};
+
+use super::params::words;
+use crate::error::{EditError, Result};
+use crate::pde::{SolverOptions, Until, UpwindScheme};
+use crate::region::{Region, parse_regions};
+
+words! {
+    /// One-sided differences of the renormalisation after each step.
+    Scheme {
+        /// First order.
+        First = "first",
+        /// HJ-WENO5.
+        Weno5 = "weno5",
+    }
+}
+
+words! {
+    /// Whose numerics to use.
+    Like {
+        /// OpenVDB's `LevelSetFilter`: HJ-WENO5, Euler steps, three normalisations, its epsilon.
+        OpenVdb = "openvdb",
+    }
+}
+
+/// Regions in the order given: each multiplies the ones before; `or …` joins, `not …` leaves out.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[serde(transparent)]
+pub struct RegionSpecs(pub Vec<String>);
+
+impl<'de> Deserialize<'de> for RegionSpecs {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(untagged)]
+        enum Form {
+            One(String),
+            Several(Vec<String>),
+        }
+        Ok(Self(match Form::deserialize(deserializer)? {
+            Form::One(spec) => vec![spec],
+            Form::Several(specs) => specs,
+        }))
+    }
+}
+
+impl JsonSchema for RegionSpecs {
+    fn schema_name() -> Cow<'static, str> {
+        "RegionSpecs".into()
+    }
+
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({
+            "type": ["array", "string"], "items": { "type": "string" }, "x-kind": "'sphere center=… radius=…'", "x-list": true
+        })
+    }
+}
+
+impl RegionSpecs {
+    /// The region, or `None` for everywhere.
+    pub fn parse(&self) -> Result<Option<Box<dyn Region>>> {
+        parse_regions(&self.0)
+    }
+}
+
+/// How long a flow runs, where, and how it is solved.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct EvolutionOptions {
+    /// Steps of the largest stable size; 10 if neither this nor `time` is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub iterations: Option<u32>,
+    /// Flow time instead of a number of steps, in world units squared (a sphere of radius R shrinks as R² − 2·time).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub time: Option<f64>,
+    /// Where to act, and how strongly; everywhere if not given. Several multiply; see `vdb-edit regions`.
+    pub region: RegionSpecs,
+    /// One-sided differences of the renormalisation after each step; weno5 if not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scheme: Option<Scheme>,
+    /// Renormalisations after each step; 1 if not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub normalizations: Option<u32>,
+    /// Take another tool's scheme, integrator, normalisation count and epsilon, to compare results one to one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub like: Option<Like>,
+}
+
+/// Steps where nothing is asked for: enough to see, few enough to take back.
+const DEFAULT_ITERATIONS: u32 = 10;
+
+/// Most renormalisations a step: more move the surface instead of repairing the distance.
+const MOST_NORMALIZATIONS: u32 = 100;
+
+impl EvolutionOptions {
+    /// Refuses what cannot work.
+    pub fn validate(&self, operation: &str) -> Result<()> {
+        if let (Some(_), Some(time)) = (self.iterations, self.time) {
+            return Err(EditError::parameter(operation, "time", time, "either `iterations` or `time`, not both"));
+        }
+        if let Some(time) = self.time
+            && !(time >= 0.0 && time.is_finite())
+        {
+            return Err(EditError::parameter(
+                operation,
+                "time",
+                time,
+                "a finite number of world units squared, 0 or more",
+            ));
+        }
+        if let Some(n) = self.normalizations
+            && n > MOST_NORMALIZATIONS
+        {
+            return Err(EditError::parameter(operation, "normalizations", n, format!("0 to {MOST_NORMALIZATIONS}")));
+        }
+        if self.like.is_some() && (self.scheme.is_some() || self.normalizations.is_some()) {
+            return Err(EditError::parameter(
+                operation,
+                "like",
+                "openvdb",
+                "without `scheme` and `normalizations`: it sets both",
+            ));
+        }
+        self.region.parse().map(drop)
+    }
+
+    /// When the flow ends.
+    pub fn until(&self) -> Until {
+        match self.time {
+            Some(time) => Until::Time(time),
+            None => Until::Iterations(self.iterations.unwrap_or(DEFAULT_ITERATIONS)),
+        }
+    }
+
+    /// How it is solved: `defaults` of the operator, changed by what was given.
+    pub fn solver(&self, defaults: SolverOptions) -> SolverOptions {
+        if self.like.is_some() {
+            return SolverOptions::OPENVDB;
+        }
+        SolverOptions {
+            scheme: match self.scheme {
+                None => defaults.scheme,
+                Some(Scheme::First) => UpwindScheme::First,
+                Some(Scheme::Weno5) => UpwindScheme::HjWeno5,
+            },
+            normalizations: self.normalizations.unwrap_or(defaults.normalizations),
+            ..defaults
+        }
+    }
+}

@@ -1,0 +1,97 @@
+//! Which voxels a step may write: everything, or what a region touches.
+
+use crate::grid::{Grid, LeafId, LeafMask, LeafSet, Paged};
+use crate::region::RegionWeights;
+
+/// The leaves that a flow works on and, with a region, its weights and the voxels that must keep their bits.
+pub(super) struct Domain {
+    leaves: LeafSet,
+    local: Option<Local>,
+}
+
+struct Local {
+    weights: RegionWeights,
+    /// Voxels that were active at the start and have weight 0.
+    frozen: Paged<LeafMask>,
+}
+
+impl Domain {
+    /// Every leaf of a grid.
+    pub fn everywhere(grid: &Grid) -> Self {
+        Self { leaves: grid.leaf_set().clone(), local: None }
+    }
+
+    /// The leaves that a region touches.
+    pub fn region(grid: &Grid, weights: RegionWeights) -> Self {
+        let mut frozen = Paged::filled(grid.value_pages().page_count(), LeafMask::EMPTY);
+        frozen.par_update(grid.leaf_set(), |id, frozen: &mut LeafMask| {
+            *frozen = grid.mask(id).zip(positive(&weights, id), |active, moves| active & !moves);
+        });
+        Self { leaves: weights.leaves().clone(), local: Some(Local { weights, frozen }) }
+    }
+
+    /// The leaves to work on.
+    pub fn leaves(&self) -> &LeafSet {
+        &self.leaves
+    }
+
+    /// Whether only part of the grid is worked on.
+    pub fn is_local(&self) -> bool {
+        self.local.is_some()
+    }
+
+    /// The weights, where there is a region.
+    pub fn weights(&self) -> Option<&RegionWeights> {
+        self.local.as_ref().map(|l| &l.weights)
+    }
+
+    /// The weights, to be extended.
+    pub fn weights_mut(&mut self) -> Option<&mut RegionWeights> {
+        self.local.as_mut().map(|l| &mut l.weights)
+    }
+
+    /// Of the active voxels of a leaf, those that a flow moves: weight above 0.
+    #[inline(always)]
+    pub fn moving(&self, id: LeafId, active: LeafMask) -> LeafMask {
+        match &self.local {
+            None => active,
+            Some(local) => active.zip(positive(&local.weights, id), |a, moves| a & moves),
+        }
+    }
+
+    /// Of the active voxels of a leaf, those that renormalisation and trimming may change: all but the frozen ones.
+    #[inline(always)]
+    pub fn repairable(&self, id: LeafId, active: LeafMask) -> LeafMask {
+        match &self.local {
+            None => active,
+            Some(local) => active.zip(*local.frozen.get(id), |a, frozen| a & !frozen),
+        }
+    }
+
+    /// Takes leaves into the domain: new ones of the grid, or old ones that got new voxels.
+    pub fn include(&mut self, leaves: &[LeafId], pages: usize) {
+        for &id in leaves {
+            self.leaves.insert(id);
+        }
+        if let Some(local) = &mut self.local {
+            local.frozen.grow(pages, LeafMask::EMPTY);
+        }
+    }
+
+    /// Forgets leaves that the grid lost.
+    pub fn forget(&mut self, leaves: &[LeafId]) {
+        for &id in leaves {
+            self.leaves.remove(id);
+        }
+    }
+}
+
+/// Where the weight is above 0.
+#[inline(always)]
+fn positive(weights: &RegionWeights, id: LeafId) -> LeafMask {
+    if !weights.leaves().contains(id) {
+        return LeafMask::EMPTY;
+    }
+    let alpha = &weights.alpha(id).0;
+    LeafMask(std::array::from_fn(|x| (0..64).fold(0, |word, bit| word | u64::from(alpha[x * 64 + bit] > 0.0) << bit)))
+}

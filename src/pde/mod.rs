@@ -1,0 +1,63 @@
+//! Partial differential equations on the narrow band: the only time loop in the house.
+//!
+//! [`evolve`] moves a surface with a [`SpeedFunction`]; [`renormalize`] restores |∇φ| = 1; [`track`] lets the band follow
+//! the surface: dilate, renormalise, trim. Filters that are no flows use the same [`Tracker`].
+
+mod domain;
+mod evolve;
+mod renormalize;
+mod speed;
+mod step;
+mod track;
+mod tracker;
+
+pub use evolve::{Report, StopReason, Until, evolve};
+pub use renormalize::renormalize;
+pub use speed::{GradientNorm, LeafFields, SpeedFunction, WantedFields};
+pub use track::track;
+pub use tracker::Tracker;
+
+pub use crate::stencil::upwind::{UpwindScheme, WenoEpsilon};
+
+/// Explicit Runge–Kutta schemes that do not increase total variation (Shu & Osher 1988).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum TimeIntegrator {
+    /// Forward Euler.
+    #[default]
+    TvdRk1,
+    /// Second order.
+    TvdRk2,
+    /// Third order.
+    TvdRk3,
+}
+
+/// How a flow is solved, as against what is asked and how it is run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SolverOptions {
+    /// One-sided differences of renormalisation.
+    pub scheme: UpwindScheme,
+    /// Time integration of renormalisation.
+    pub integrator: TimeIntegrator,
+    /// Renormalisation steps each time the band is tracked.
+    pub normalizations: u32,
+    /// What keeps the weights of WENO5 finite.
+    pub weno_epsilon: WenoEpsilon,
+}
+
+impl SolverOptions {
+    /// The cheapest: first-order differences, one Euler step.
+    pub const FIRST_ORDER: Self = Self {
+        scheme: UpwindScheme::First,
+        integrator: TimeIntegrator::TvdRk1,
+        normalizations: 1,
+        weno_epsilon: WenoEpsilon::SCALE_FREE,
+    };
+
+    /// What OpenVDB's `LevelSetFilter` uses: HJ-WENO5, Euler, three normalisations, its ε.
+    pub const OPENVDB: Self = Self {
+        scheme: UpwindScheme::HjWeno5,
+        integrator: TimeIntegrator::TvdRk1,
+        normalizations: 3,
+        weno_epsilon: WenoEpsilon::OPENVDB,
+    };
+}

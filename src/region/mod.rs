@@ -1,0 +1,89 @@
+//! Where an operator may act, and how strongly: a weight of 0..1 at every point (Museth et al. 2002, section 4.1; MATH 2).
+//!
+//! An operator's result is (1 − α)·old + α·new. Where α = 0, every voxel that was active keeps its bits. Regions are
+//! feathered by default, so that the result stays a distance at the region's rim.
+
+mod primitive;
+mod spec;
+mod weights;
+
+use glam::DVec3;
+
+pub use primitive::{Primitive, Shape};
+pub use spec::parse_regions;
+pub use weights::RegionWeights;
+
+/// A weight in space.
+pub trait Region: Send + Sync {
+    /// α in 0..1 at a world position.
+    fn weight(&self, xyz: DVec3) -> f32;
+
+    /// World-space box outside which α is 0; `None` if there is none.
+    fn bounds(&self) -> Option<(DVec3, DVec3)>;
+}
+
+/// Museth's C¹ ramp P: 0 below 0, 2β² up to ½, 1 − 2(β − 1)² up to 1, then 1.
+pub fn ramp(beta: f64) -> f64 {
+    if beta <= 0.0 {
+        0.0
+    } else if beta <= 0.5 {
+        2.0 * beta * beta
+    } else if beta < 1.0 {
+        1.0 - 2.0 * (beta - 1.0) * (beta - 1.0)
+    } else {
+        1.0
+    }
+}
+
+/// P stretched to rise from `low` to `high`; the step at `high` where they coincide.
+pub fn ramp_between(value: f64, low: f64, high: f64) -> f64 {
+    if high <= low { f64::from(u8::from(value > high)) } else { ramp((value - low) / (high - low)) }
+}
+
+/// How regions combine.
+pub enum Combined {
+    /// α = Π αᵢ: where all of them act.
+    All(Vec<Box<dyn Region>>),
+    /// α = max αᵢ: where any of them acts.
+    Any(Vec<Box<dyn Region>>),
+    /// α = 1 − α: everywhere else.
+    Not(Box<dyn Region>),
+}
+
+impl Region for Combined {
+    fn weight(&self, xyz: DVec3) -> f32 {
+        match self {
+            Self::All(parts) => parts.iter().map(|p| p.weight(xyz)).product(),
+            Self::Any(parts) => parts.iter().map(|p| p.weight(xyz)).fold(0.0, f32::max),
+            Self::Not(part) => 1.0 - part.weight(xyz),
+        }
+    }
+
+    fn bounds(&self) -> Option<(DVec3, DVec3)> {
+        match self {
+            Self::All(parts) => {
+                parts.iter().filter_map(|p| p.bounds()).reduce(|a, b| (a.0.max(b.0), a.1.min(b.1).max(a.0.max(b.0))))
+            }
+            Self::Any(parts) => parts
+                .iter()
+                .map(|p| p.bounds())
+                .reduce(|a, b| a.zip(b).map(|(a, b)| (a.0.min(b.0), a.1.max(b.1))))
+                .flatten(),
+            Self::Not(_) => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ramp_has_the_values_of_the_paper() {
+        for (beta, p) in [(-1.0, 0.0), (0.0, 0.0), (0.25, 0.125), (0.5, 0.5), (0.75, 0.875), (1.0, 1.0), (9.0, 1.0)] {
+            assert_eq!(ramp(beta), p);
+        }
+        assert_eq!(ramp_between(8.0, 7.0, 9.0), 0.5);
+        assert_eq!((ramp_between(7.0, 7.0, 7.0), ramp_between(7.1, 7.0, 7.0)), (0.0, 1.0));
+    }
+}

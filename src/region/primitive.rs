@@ -1,0 +1,175 @@
+//! Regions inside closed shapes, and half spaces.
+//!
+//! Each closed shape has a function s that is 0 at its centre, 1 on its boundary and grows linearly along rays from the
+//! centre ("0.9" is 90 % of the size in every direction). The weight is D = 1 − P(s; s_min, s_max) (MATH 2.1, 2.3).
+
+use glam::{DMat3, DVec3};
+
+use super::{Region, ramp_between};
+use crate::error::{EditError, Result};
+
+/// A closed shape or half space; lengths in world units.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Shape {
+    /// |q| / radius.
+    Sphere {
+        /// Radius.
+        radius: f64,
+    },
+    /// max |qᵢ| / half size.
+    Box {
+        /// Half of each edge.
+        half_size: DVec3,
+    },
+    /// Capped cylinder along local z: max(hypot(x, y) / radius, |z| / half height).
+    Cylinder {
+        /// Radius.
+        radius: f64,
+        /// Half of the height.
+        half_height: f64,
+    },
+    /// Barr's superellipsoid: s = I^(e1/2), I = (|x/a|^(2/e2) + |y/b|^(2/e2))^(e2/e1) + |z/c|^(2/e1).
+    Superellipsoid {
+        /// Semi-axes a, b, c.
+        radii: DVec3,
+        /// Exponents e1 (north–south) and e2 (east–west), 0.1..2.
+        exponents: [f64; 2],
+    },
+}
+
+impl Shape {
+    /// The radially linear s at a local position.
+    fn size_fraction(&self, q: DVec3) -> f64 {
+        match *self {
+            Self::Sphere { radius } => q.length() / radius,
+            Self::Box { half_size } => (q / half_size).abs().max_element(),
+            Self::Cylinder { radius, half_height } => (q.x.hypot(q.y) / radius).max(q.z.abs() / half_height),
+            Self::Superellipsoid { radii, exponents: [e1, e2] } => {
+                let r = (q / radii).abs();
+                // Homogeneous of degree one: taking out the largest part keeps the powers finite.
+                let scale = r.max_element();
+                if scale == 0.0 {
+                    return 0.0;
+                }
+                let r = r / scale;
+                let equator = (r.x.powf(2.0 / e2) + r.y.powf(2.0 / e2)).powf(e2 / e1);
+                scale * (equator + r.z.powf(2.0 / e1)).powf(e1 / 2.0)
+            }
+        }
+    }
+
+    /// Half edges of the local box around the shape.
+    fn extent(&self) -> DVec3 {
+        match *self {
+            Self::Sphere { radius } => DVec3::splat(radius),
+            Self::Box { half_size } => half_size,
+            Self::Cylinder { radius, half_height } => DVec3::new(radius, radius, half_height),
+            Self::Superellipsoid { radii, .. } => radii,
+        }
+    }
+}
+
+/// A placed shape with a soft edge.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Primitive {
+    centre: DVec3,
+    /// Local axes as columns, orthonormal.
+    axes: DMat3,
+    shape: Shape,
+    soft: [f64; 2],
+}
+
+impl Primitive {
+    /// The soft edge where none is asked for: full weight inside 90 % of the size, none on the boundary.
+    pub const DEFAULT_SOFT: [f64; 2] = [0.9, 1.0];
+
+    /// A shape at `centre`, its local axes the orthonormal columns of `axes`; the weight falls from 1 at `soft[0]` of the size to 0 at `soft[1]`.
+    pub fn new(shape: Shape, centre: DVec3, axes: DMat3, soft: [f64; 2]) -> Result<Self> {
+        let refuse =
+            |field: &str, value: String, accepted: &str| Err(EditError::parameter("region", field, value, accepted));
+        let extent = shape.extent();
+        if !(extent.min_element() > 0.0 && extent.is_finite()) {
+            return refuse("size", format!("{extent}"), "every size of a region must be positive and finite");
+        }
+        if let Shape::Superellipsoid { exponents, .. } = &shape
+            && exponents.iter().any(|e| !(0.1..=2.0).contains(e))
+        {
+            return refuse("exponents", format!("{exponents:?}"), "exponents between 0.1 and 2");
+        }
+        if !centre.is_finite() {
+            return refuse("center", format!("{centre}"), "three finite numbers");
+        }
+        if !(0.0 <= soft[0] && soft[0] <= soft[1] && soft[1].is_finite()) {
+            return refuse(
+                "soft",
+                format!("{},{}", soft[0], soft[1]),
+                "two parts of the size, the smaller first, such as 0.9,1",
+            );
+        }
+        Ok(Self { centre, axes, shape, soft })
+    }
+}
+
+impl Region for Primitive {
+    fn weight(&self, xyz: DVec3) -> f32 {
+        let local = self.axes.transpose() * (xyz - self.centre);
+        let s = self.shape.size_fraction(local);
+        if self.soft[0] == self.soft[1] {
+            return f32::from(u8::from(s < self.soft[1]));
+        }
+        (1.0 - ramp_between(s, self.soft[0], self.soft[1])) as f32
+    }
+
+    fn bounds(&self) -> Option<(DVec3, DVec3)> {
+        let extent = self.shape.extent() * self.soft[1];
+        let abs = DMat3::from_cols(self.axes.x_axis.abs(), self.axes.y_axis.abs(), self.axes.z_axis.abs());
+        let reach = abs * extent;
+        Some((self.centre - reach, self.centre + reach))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at_origin(shape: Shape) -> Primitive {
+        Primitive::new(shape, DVec3::ZERO, DMat3::IDENTITY, Primitive::DEFAULT_SOFT).unwrap()
+    }
+
+    #[test]
+    fn superellipsoid_is_homogeneous() {
+        // MATH 2.3.
+        let ellipsoid = Shape::Superellipsoid { radii: DVec3::new(3.0, 2.0, 1.0), exponents: [1.0, 1.0] };
+        for (p, s) in [([3.0, 0.0, 0.0], 1.0), ([0.0, 2.0, 0.0], 1.0), ([0.0, 0.0, 1.0], 1.0), ([1.5, 0.0, 0.0], 0.5)] {
+            assert!((ellipsoid.size_fraction(DVec3::from(p)) - s).abs() < 1e-12);
+        }
+        let boxy = Shape::Superellipsoid { radii: DVec3::new(3.0, 2.0, 1.0), exponents: [0.2, 0.2] };
+        let corner = DVec3::new(2.97, 1.98, 0.99);
+        assert!((boxy.size_fraction(corner) - 1.105).abs() < 5e-4);
+        assert!((boxy.size_fraction(corner * 0.25) - 1.105 * 0.25).abs() < 2e-4);
+        assert_eq!(boxy.size_fraction(DVec3::ZERO), 0.0);
+    }
+
+    #[test]
+    fn weights_fall_between_the_soft_limits() {
+        for (shape, axis) in [
+            (Shape::Sphere { radius: 2.0 }, DVec3::X * 2.0),
+            (Shape::Box { half_size: DVec3::new(1.0, 2.0, 3.0) }, DVec3::Z * 3.0),
+            (Shape::Cylinder { radius: 2.0, half_height: 1.0 }, DVec3::Z),
+        ] {
+            let region = at_origin(shape);
+            for (s, w) in [(0.5, 1.0), (0.9, 1.0), (0.95, 0.5), (1.0, 0.0), (1.5, 0.0)] {
+                assert!((region.weight(axis * s) - w).abs() < 1e-6, "{region:?} {s}");
+            }
+        }
+    }
+
+    #[test]
+    fn refuses_what_cannot_work() {
+        for (radius, soft) in
+            [(0.0, [0.9, 1.0]), (f64::NAN, [0.9, 1.0]), (1.0, [1.0, 0.9]), (1.0, [0.5, f64::INFINITY])]
+        {
+            assert!(Primitive::new(Shape::Sphere { radius }, DVec3::ZERO, DMat3::IDENTITY, soft).is_err());
+        }
+    }
+}
