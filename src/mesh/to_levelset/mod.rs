@@ -62,6 +62,11 @@ impl MeshToLevelSet {
             let accepted = "it must be positive and finite, in the mesh's units";
             return Err(EditError::parameter(OPERATION, "voxel_size", self.voxel_size, accepted));
         }
+        let background = (self.voxel_size * f64::from(self.half_width)) as f32;
+        if !(background.is_normal() && (self.voxel_size as f32).is_normal()) {
+            let accepted = "distances are stored as f32, whose range of 1e-38 to 3e38 it must stay in";
+            return Err(EditError::parameter(OPERATION, "voxel_size", self.voxel_size, accepted));
+        }
         if !(NARROWEST..=WIDEST).contains(&self.half_width) {
             let accepted = format!("the band reaches {NARROWEST} to {WIDEST} voxels to each side (3 is usual)");
             return Err(EditError::parameter(OPERATION, "half_width", self.half_width, accepted));
@@ -130,7 +135,7 @@ fn repair(
     };
     run.check(OPERATION)?;
     let t0 = std::time::Instant::now();
-    let pieces = separating_pieces(&clean.positions, &clean.triangles, &bvh, &winding, &rim);
+    let pieces = separating_pieces(&clean.positions, &clean.triangles, &bvh, &winding, &rim, run)?;
     findings.removed_area_fraction = pieces.removed_area_fraction;
     run.check(OPERATION)?;
     println!("  pieces {:?} kept {}", t0.elapsed(), pieces.kept.len());
@@ -431,8 +436,15 @@ mod tests {
     #[ignore]
     fn survey() {
         for file in std::env::var("SURVEY").unwrap().split(',') {
-            let Some(mesh) = shared_mesh(file) else { continue };
-            let (lo, hi) = mesh.bounding_box().unwrap();
+            let Some(path) = shared(file) else { continue };
+            let mesh = match crate::mesh::read(&path) {
+                Ok(m) => m.mesh,
+                Err(e) => {
+                    println!("{file}: READ {e}");
+                    continue;
+                }
+            };
+            let (lo, hi) = mesh.bounding_box().unwrap_or_default();
             let n: f64 = std::env::var("RES").map_or(128.0, |r| r.parse().unwrap());
             let start = std::time::Instant::now();
             match convert(&mesh, (hi - lo).max_element() / n) {

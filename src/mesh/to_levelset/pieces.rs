@@ -13,8 +13,10 @@ use rustc_hash::FxHashMap;
 
 use super::inside::{Rim, WINDING_ERROR};
 use super::intersect::intersecting;
+use crate::error::Result;
 use crate::mesh::winding::BATCH;
 use crate::mesh::{Bvh, WindingNumber};
+use crate::run::RunOptions;
 
 /// Longest edge, in voxels, of the pieces that are judged first.
 const COARSE: f64 = 2.0;
@@ -32,6 +34,31 @@ pub(super) struct Pieces {
     pub removed_area_fraction: f64,
 }
 
+/// Part of a triangle.
+struct Piece {
+    triangle: u32,
+    corners: [DVec3; 3],
+}
+
+impl Piece {
+    fn center(&self) -> DVec3 {
+        let [a, b, c] = self.corners;
+        (a + b + c) / 3.0
+    }
+
+    /// A point just beside it, in front of it or behind it.
+    fn beside(&self, side: f64) -> DVec3 {
+        let [a, b, c] = self.corners;
+        self.center() + (b - a).cross(c - a).normalize_or_zero() * (side * BESIDE)
+    }
+
+    /// Cuts it until no edge is longer than `size`.
+    fn cut(&self, size: f64) -> impl Iterator<Item = Self> {
+        let triangle = self.triangle;
+        cut(self.corners, size).into_iter().map(move |corners| Self { triangle, corners })
+    }
+}
+
 /// Cuts and judges the triangles of an indexed mesh in index space.
 pub(super) fn separating_pieces(
     positions: &[DVec3],
@@ -39,58 +66,51 @@ pub(super) fn separating_pieces(
     bvh: &Bvh,
     winding: &WindingNumber<'_>,
     rim: &Rim,
-) -> Pieces {
-    let crossed = intersecting(bvh, positions, triangles);
-    let corners = |t: u32| triangles[t as usize].map(|v| positions[v as usize]);
-    let total: f64 = (0..triangles.len() as u32).map(|t| area(&corners(t))).sum();
+    run: &RunOptions,
+) -> Result<Pieces> {
+    let whole = |t: u32| Piece { triangle: t, corners: triangles[t as usize].map(|v| positions[v as usize]) };
+    let total: f64 = (0..triangles.len() as u32).map(|t| area(&whole(t).corners)).sum();
     let mut removed = 0.0;
     let mut kept = Vec::new();
-    let mut open = Vec::new();
     // In the order of the tree, so that those judged together lie together.
-    let (mut whole, others): (Vec<u32>, Vec<u32>) = bvh.order().iter().partition(|&&t| !crossed[t as usize]);
-    let verdicts: Vec<Option<bool>> = whole
-        .par_chunks(BATCH)
-        .flat_map_iter(|chunk| {
-            let fronts = by_batch(chunk, |&t| beside(&corners(t), 1.0), winding);
-            chunk.iter().zip(fronts).map(|(&t, front)| verdict_by_one_point(corners(t), front, rim)).collect::<Vec<_>>()
-        })
-        .collect();
-    let mut verdicts = verdicts.into_iter();
-    whole.retain(|&t| match verdicts.next().flatten() {
-        Some(true) => {
-            kept.push(corners(t));
-            false
+    let crossed = intersecting(bvh, positions, triangles);
+    let (simple, mut open): (Vec<Piece>, Vec<Piece>) =
+        bvh.order().iter().map(|&t| whole(t)).partition(|piece| !crossed[piece.triangle as usize]);
+    let fronts = by_batches(&simple, 1.0, winding);
+    for (piece, front) in simple.into_iter().zip(fronts) {
+        match verdict_by_one_point(piece.corners, front, rim) {
+            Some(true) => kept.push(piece.corners),
+            Some(false) => removed += area(&piece.corners),
+            None => open.push(piece),
         }
-        Some(false) => {
-            removed += area(&corners(t));
-            false
-        }
-        None => true,
-    });
+    }
     let mut size = COARSE;
-    open.extend(whole.par_iter().chain(&others).flat_map_iter(|&t| cut(corners(t), size)).collect::<Vec<_>>());
+    let mut open: Vec<Piece> = open.par_iter().flat_map_iter(|piece| piece.cut(COARSE)).collect();
     while !open.is_empty() {
-        let counts: Vec<bool> = open
-            .par_chunks(BATCH)
-            .flat_map_iter(|chunk| {
-                let fronts = by_batch(chunk, |piece| beside(piece, 1.0), winding);
-                let backs = by_batch(chunk, |piece| beside(piece, -1.0), winding);
-                fronts.into_iter().zip(backs).map(|(front, back)| (front > 0.5) != (back > 0.5)).collect::<Vec<_>>()
-            })
-            .collect();
-        let border = if size > FINE { borders(&open, &counts, size) } else { vec![false; open.len()] };
+        run.check("mesh to level set")?;
+        let bytes = (open.len() + kept.len()) * 4 * std::mem::size_of::<Piece>();
+        run.reserve(
+            "mesh to level set",
+            bytes as u64,
+            "the mesh overlaps itself in many places; take a larger voxel_size",
+        )?;
+        let fronts = by_batches(&open, 1.0, winding);
+        let backs = by_batches(&open, -1.0, winding);
+        let counts: Vec<bool> =
+            fronts.iter().zip(&backs).map(|(front, back)| (*front > 0.5) != (*back > 0.5)).collect();
+        let border = if size > FINE { borders(&open, &counts, size, triangles) } else { vec![false; open.len()] };
         let mut next = Vec::new();
         for ((piece, counts), border) in open.into_iter().zip(counts).zip(border) {
             match (border, counts) {
-                (true, _) => next.extend(cut(piece, size / 2.0)),
-                (false, true) => kept.push(piece),
-                (false, false) => removed += area(&piece),
+                (true, _) => next.extend(piece.cut(size / 2.0)),
+                (false, true) => kept.push(piece.corners),
+                (false, false) => removed += area(&piece.corners),
             }
         }
         open = next;
         size /= 2.0;
     }
-    Pieces { kept, removed_area_fraction: if total > 0.0 { removed / total } else { 0.0 } }
+    Ok(Pieces { kept, removed_area_fraction: if total > 0.0 { removed / total } else { 0.0 } })
 }
 
 /// Whether a triangle that no other one touches counts, from the winding number in front of its centre; behind it is one
@@ -104,44 +124,41 @@ fn verdict_by_one_point(corners: [DVec3; 3], front: f64, rim: &Rim) -> Option<bo
     ((front.abs() - 0.5).abs() > margin).then_some(front.abs() < 0.5)
 }
 
-/// A point just beside a piece, in front of it or behind it.
-fn beside(piece: &[DVec3; 3], side: f64) -> DVec3 {
-    let [a, b, c] = piece;
-    (a + b + c) / 3.0 + (b - a).cross(c - a).normalize_or_zero() * (side * BESIDE)
+/// Winding numbers beside each piece.
+fn by_batches(pieces: &[Piece], side: f64, winding: &WindingNumber<'_>) -> Vec<f64> {
+    let batch = |chunk: &[Piece]| {
+        let point = |i: usize| chunk.get(i).or(chunk.last()).map_or(DVec3::ZERO, |piece| piece.beside(side));
+        winding.at_each::<BATCH>(&std::array::from_fn(point)).into_iter().take(chunk.len())
+    };
+    pieces.par_chunks(BATCH).flat_map_iter(batch).collect()
 }
 
-/// Winding numbers at a point each of up to [`BATCH`] things.
-fn by_batch<T>(things: &[T], point: impl Fn(&T) -> DVec3, winding: &WindingNumber<'_>) -> Vec<f64> {
-    let Some(last) = things.last() else { return Vec::new() };
-    let points = std::array::from_fn(|i| point(things.get(i).unwrap_or(last)));
-    winding.at_each::<BATCH>(&points)[..things.len().min(BATCH)].to_vec()
-}
-
-/// Which pieces lie beside a piece of the other kind.
-fn borders(pieces: &[[DVec3; 3]], counts: &[bool], size: f64) -> Vec<bool> {
-    // Centroids of pieces that touch are within 4/3 of the longest edge: in this cell or the next.
-    let edge = size * 4.0 / 3.0;
-    let center = |piece: &[DVec3; 3]| (piece[0] + piece[1] + piece[2]) / 3.0;
-    let cell = |p: DVec3| (p / edge).floor().as_i64vec3();
-    let mut cells: FxHashMap<I64Vec3, [Vec<DVec3>; 2]> = FxHashMap::default();
-    let differ = counts.iter().any(|&c| c) && counts.iter().any(|&c| !c);
-    if !differ {
+/// Which pieces lie beside a piece of the other kind on the same surface: of the same triangle or one that shares a vertex.
+fn borders(pieces: &[Piece], counts: &[bool], size: f64, triangles: &[[u32; 3]]) -> Vec<bool> {
+    if counts.iter().all(|&c| c) || !counts.iter().any(|&c| c) {
         return vec![false; pieces.len()];
     }
+    // Centres of pieces that touch are within 4/3 of the longest edge: in this cell or the next.
+    let edge = size * 4.0 / 3.0;
+    let cell = |p: DVec3| (p / edge).floor().as_i64vec3();
+    let mut cells: FxHashMap<I64Vec3, [Vec<(DVec3, u32)>; 2]> = FxHashMap::default();
     for (piece, &counts) in pieces.iter().zip(counts) {
-        let center = center(piece);
-        cells.entry(cell(center)).or_default()[usize::from(counts)].push(center);
+        let center = piece.center();
+        cells.entry(cell(center)).or_default()[usize::from(counts)].push((center, piece.triangle));
     }
+    let share = |a: u32, b: u32| a == b || triangles[a as usize].iter().any(|v| triangles[b as usize].contains(v));
     pieces
         .par_iter()
         .zip(counts)
         .map(|(piece, &counts)| {
-            let center = center(piece);
+            let center = piece.center();
             let middle = cell(center);
             (0..27).any(|i| {
                 let neighbour = middle + I64Vec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1);
                 let others = cells.get(&neighbour).map_or(&[][..], |c| &c[usize::from(!counts)]);
-                others.iter().any(|other| other.distance_squared(center) <= edge * edge)
+                others.iter().any(|&(other, triangle)| {
+                    other.distance_squared(center) <= edge * edge && share(piece.triangle, triangle)
+                })
             })
         })
         .collect()
@@ -210,7 +227,15 @@ mod tests {
     fn pieces(mesh: &TriangleMesh) -> Pieces {
         let bvh = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect());
         let rim = Rim::new(&mesh.positions, &mesh.triangles);
-        separating_pieces(&mesh.positions, &mesh.triangles, &bvh, &WindingNumber::new(&bvh), &rim)
+        separating_pieces(
+            &mesh.positions,
+            &mesh.triangles,
+            &bvh,
+            &WindingNumber::new(&bvh),
+            &rim,
+            &RunOptions::default(),
+        )
+        .unwrap()
     }
 
     #[test]
