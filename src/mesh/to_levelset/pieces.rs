@@ -26,6 +26,12 @@ const FINE: f64 = 0.25;
 /// distance of two walls that a grid could tell apart.
 const BESIDE: f64 = 1e-3;
 
+/// How near the centres of pieces are that lie beside each other, in longest edges. Halves of a right-angled triangle have
+/// theirs at a third, equal neighbours across a shorter edge at half; the farthest, 4/3, are slivers end to end.
+const BESIDE_EACH_OTHER: f64 = 0.75;
+/// Pieces judged at once at most: a surface that crosses itself everywhere is cut less finely.
+const LIMIT: usize = 1 << 20;
+
 /// What remains of a surface.
 pub(super) struct Pieces {
     /// The pieces that count.
@@ -98,7 +104,11 @@ pub(super) fn separating_pieces(
         let backs = by_batches(&open, -1.0, winding);
         let counts: Vec<bool> =
             fronts.iter().zip(&backs).map(|(front, back)| (*front > 0.5) != (*back > 0.5)).collect();
-        let border = if size > FINE { borders(&open, &counts, size, triangles) } else { vec![false; open.len()] };
+        let border = if size > FINE && open.len() < LIMIT {
+            borders(&open, &counts, size, triangles)
+        } else {
+            vec![false; open.len()]
+        };
         let mut next = Vec::new();
         for ((piece, counts), border) in open.into_iter().zip(counts).zip(border) {
             match (border, counts) {
@@ -138,8 +148,7 @@ fn borders(pieces: &[Piece], counts: &[bool], size: f64, triangles: &[[u32; 3]])
     if counts.iter().all(|&c| c) || !counts.iter().any(|&c| c) {
         return vec![false; pieces.len()];
     }
-    // Centres of pieces that touch are within 4/3 of the longest edge: in this cell or the next.
-    let edge = size * 4.0 / 3.0;
+    let edge = size * BESIDE_EACH_OTHER;
     let cell = |p: DVec3| (p / edge).floor().as_i64vec3();
     let mut cells: FxHashMap<I64Vec3, [Vec<(DVec3, u32)>; 2]> = FxHashMap::default();
     for (piece, &counts) in pieces.iter().zip(counts) {
