@@ -8,11 +8,12 @@
 use std::collections::VecDeque;
 
 use glam::DVec3;
+use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::topology::{DisjointSets, EdgeUse, by_edge, edge_uses, is_degenerate, sorted, volume_about};
 use super::winding::solid_angle;
-use super::{MeshFindings, TriangleMesh, analyze};
+use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber, analyze};
 
 /// How near two vertices on open edges must be to be joined, relative to the diagonal of the bounding box. Exporters
 /// that write f32 move a corner by 1e-7 of the coordinates; real gaps of models are above 1e-4.
@@ -219,8 +220,8 @@ impl Patches {
     }
 }
 
-/// Turns outwards what encloses a negative volume: all of the mesh, its open pieces together, its closed parts one by one
-/// unless they are cavities.
+/// Turns outwards what faces inwards: all closed parts if their volume is negative, all open pieces together by their winding
+/// numbers, and single closed parts unless they are cavities.
 fn orient_outwards(mesh: &mut TriangleMesh, patches: &Patches, findings: &mut MeshFindings) {
     let Some((lo, hi)) = mesh.bounding_box() else { return };
     let middle = lo + (hi - lo) * 0.5;
@@ -230,16 +231,14 @@ fn orient_outwards(mesh: &mut TriangleMesh, patches: &Patches, findings: &mut Me
     }
     let ids = 0..patches.closed.len() as u32;
     let is_closed = |p: &u32| patches.closed[*p as usize];
-    let total: f64 = volumes.iter().sum();
-    // A patch between non-manifold edges is part of a shell whose other parts it must agree with, so all such turn together.
-    let loose: f64 = ids.clone().filter(|p| !is_closed(p)).map(|p| volumes[p as usize]).sum();
     let mut turned: FxHashSet<u32> = FxHashSet::default();
-    if total < 0.0 {
+    if ids.clone().filter(is_closed).map(|p| volumes[p as usize]).sum::<f64>() < 0.0 {
         findings.inside_out = true;
-        turned.extend(ids.clone());
+        turned.extend(ids.clone().filter(is_closed));
         volumes.iter_mut().for_each(|v| *v = -*v);
-    } else if loose < 0.0 && loose.abs() > 1e-3 * total {
-        // Weighed against the closed parts, so that a flat scrap beside a solid does not decide by its noise.
+    }
+    // A patch between non-manifold edges is part of a shell whose other parts it must agree with, so all such turn together.
+    if !patches.closed.iter().all(|c| *c) && faces_inwards(mesh, patches) {
         findings.inside_out = true;
         turned.extend(ids.clone().filter(|p| !is_closed(p)));
     }
@@ -259,6 +258,30 @@ fn orient_outwards(mesh: &mut TriangleMesh, patches: &Patches, findings: &mut Me
         }
     }
     patches.turn(mesh, &turned);
+}
+
+/// Whether the open patches face inwards: the mean winding number on them, ½ on a closed surface and −½ on one that is
+/// inside out, is negative. Unlike the volume of an open surface this does not depend on an origin.
+fn faces_inwards(mesh: &TriangleMesh, patches: &Patches) -> bool {
+    /// As many triangles are asked, evenly chosen.
+    const SAMPLES: usize = 4096;
+    /// The box is scaled to this, the size of a grid, for which the tree's tolerances are made.
+    const EXTENT: f64 = 512.0;
+    let Some((lo, hi)) = mesh.bounding_box() else { return false };
+    let scale = EXTENT / (hi - lo).max_element().max(f64::MIN_POSITIVE);
+    let open = (0..mesh.triangles.len()).filter(|&t| !patches.closed[patches.of[t] as usize]);
+    let triangles: Vec<[DVec3; 3]> = open.map(|t| mesh.corners(t).map(|c| (c - lo) * scale)).collect();
+    let bvh = Bvh::new(triangles.clone());
+    let winding = WindingNumber::new(&bvh);
+    let stride = triangles.len().div_ceil(SAMPLES).max(1);
+    let facing = triangles.par_iter().step_by(stride).map(|&[a, b, c]| {
+        let normal = (b - a).cross(c - a);
+        // In front of the triangle w is ½ less than on it.
+        let front = winding.at((a + b + c) / 3.0 + normal.normalize_or_zero() * 1e-3);
+        normal.length() * (front + 0.5)
+    });
+    // Collected first: the sum of a parallel iterator depends on how it was split.
+    facing.collect::<Vec<f64>>().iter().sum::<f64>() < 0.0
 }
 
 /// The closed patches with their triangles and boxes, to find out which lies within which.

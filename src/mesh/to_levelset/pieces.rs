@@ -29,8 +29,11 @@ const BESIDE: f64 = 1e-3;
 /// How near the centres of pieces are that lie beside each other, in longest edges. Halves of a right-angled triangle have
 /// theirs at a third, equal neighbours across a shorter edge at half; the farthest, 4/3, are slivers end to end.
 const BESIDE_EACH_OTHER: f64 = 0.75;
-/// Pieces judged at once at most: a surface that crosses itself everywhere is cut less finely.
-const LIMIT: usize = 1 << 20;
+/// Cutting stops when there are this many times the pieces that it began with: a border is a line and grows slowly; where it
+/// is everywhere, as in a heap of triangles, its exact place means nothing.
+const GROWTH: usize = 2;
+/// Up to this many pieces cost too little for that to matter.
+const FEW: usize = 1 << 17;
 
 /// What remains of a surface.
 pub(super) struct Pieces {
@@ -92,6 +95,7 @@ pub(super) fn separating_pieces(
     }
     let mut size = COARSE;
     let mut open: Vec<Piece> = open.par_iter().flat_map_iter(|piece| piece.cut(COARSE)).collect();
+    let limit = FEW.max(GROWTH * open.len());
     while !open.is_empty() {
         run.check("mesh to level set")?;
         let bytes = (open.len() + kept.len()) * 4 * std::mem::size_of::<Piece>();
@@ -104,7 +108,7 @@ pub(super) fn separating_pieces(
         let backs = by_batches(&open, -1.0, winding);
         let counts: Vec<bool> =
             fronts.iter().zip(&backs).map(|(front, back)| (*front > 0.5) != (*back > 0.5)).collect();
-        let border = if size > FINE && open.len() < LIMIT {
+        let border = if size > FINE && open.len() < limit {
             borders(&open, &counts, size, triangles)
         } else {
             vec![false; open.len()]
