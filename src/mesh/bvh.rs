@@ -83,9 +83,23 @@ impl Bvh {
         (aabb.min.as_dvec3(), aabb.max.as_dvec3())
     }
 
-    /// The triangles as given, in an order in which neighbours are near each other.
-    pub(crate) fn order(&self) -> &[u32] {
-        &self.tree.primitive_indices
+    /// The triangles as given, in an order in which neighbours are near each other: that of a walk through the tree.
+    pub(crate) fn order(&self) -> Vec<u32> {
+        let mut order = Vec::with_capacity(self.triangles.len());
+        let mut stack = Vec::new();
+        if self.node_count() > 0 {
+            stack.push(0);
+        }
+        while let Some(node) = stack.pop() {
+            match self.children(node) {
+                Children::Nodes(pair) => stack.extend(pair),
+                Children::Triangles(list) => {
+                    let first = self.tree.nodes[node].first_index as usize;
+                    order.extend_from_slice(&self.tree.primitive_indices[first..first + list.len()]);
+                }
+            }
+        }
+        order
     }
 
     /// Whether `f` holds for any triangle whose leaf touches the box.

@@ -58,6 +58,11 @@ impl Rim {
         Self { groups: groups.collect() }
     }
 
+    /// Whether there is no boundary.
+    pub fn is_empty(&self) -> bool {
+        self.groups.is_empty()
+    }
+
     /// A bound of |∇w| away from triangles in the ball around `center`; `None` if it exceeds `useless`.
     pub fn steepest(&self, center: DVec3, radius: f64, useless: f64) -> Option<f64> {
         let slope = |current: &Current| {

@@ -3,8 +3,8 @@
 //! Where parts of a mesh overlap, some of its area lies inside of the union and must not attract the distance; where it is
 //! a sheet, both sides are outside. A piece counts if the winding number is above ½ on one of its sides and not on the other.
 //!
-//! Along a triangle that no other one touches the winding number changes only because of the mesh's boundary, and no
-//! faster than [`Rim`] says: such a triangle is judged by one point. Others are cut into pieces of at most
+//! In front of triangles that no others touch the winding number changes only because of the mesh's boundary, and no faster
+//! than [`Rim`] says: connected ones are judged together, by one point, as far as that goes. Others are cut into pieces of at most
 //! [`COARSE`] voxels, and where pieces that count lie beside pieces that do not, further down to [`FINE`].
 
 use glam::{DVec3, I64Vec3};
@@ -14,6 +14,7 @@ use rustc_hash::FxHashMap;
 use super::inside::{Rim, WINDING_ERROR};
 use super::intersect::intersecting;
 use crate::error::Result;
+use crate::mesh::topology::{by_edge, edge_uses};
 use crate::mesh::winding::BATCH;
 use crate::mesh::{Bvh, WindingNumber};
 use crate::run::RunOptions;
@@ -26,6 +27,8 @@ const FINE: f64 = 0.25;
 /// distance of two walls that a grid could tell apart.
 const BESIDE: f64 = 1e-3;
 
+/// Within this distance, in voxels, triangles are judged together where the mesh has a boundary.
+const TOGETHER: f64 = 4.0;
 /// How near the centres of pieces are that lie beside each other, in longest edges. Halves of a right-angled triangle have
 /// theirs at a third, equal neighbours across a shorter edge at half; the farthest, 4/3, are slivers end to end.
 const BESIDE_EACH_OTHER: f64 = 0.75;
@@ -53,6 +56,11 @@ impl Piece {
     fn center(&self) -> DVec3 {
         let [a, b, c] = self.corners;
         (a + b + c) / 3.0
+    }
+
+    /// Radius of the ball about `center` that holds it.
+    fn radius_about(&self, center: DVec3) -> f64 {
+        self.corners.iter().map(|c| c.distance_squared(center)).fold(0.0, f64::max).sqrt()
     }
 
     /// A point just beside it, in front of it or behind it.
@@ -83,11 +91,10 @@ pub(super) fn separating_pieces(
     let mut kept = Vec::new();
     // In the order of the tree, so that those judged together lie together.
     let crossed = intersecting(bvh, positions, triangles);
-    let (simple, mut open): (Vec<Piece>, Vec<Piece>) =
-        bvh.order().iter().map(|&t| whole(t)).partition(|piece| !crossed[piece.triangle as usize]);
-    let fronts = by_batches(&simple, 1.0, winding);
-    for (piece, front) in simple.into_iter().zip(fronts) {
-        match verdict_by_one_point(piece.corners, front, rim) {
+    let verdicts = verdicts_together(&whole, triangles, &crossed, winding, rim);
+    let mut open = Vec::new();
+    for piece in bvh.order().into_iter().map(whole) {
+        match verdicts[piece.triangle as usize] {
             Some(true) => kept.push(piece.corners),
             Some(false) => removed += area(&piece.corners),
             None => open.push(piece),
@@ -127,15 +134,65 @@ pub(super) fn separating_pieces(
     Ok(Pieces { kept, removed_area_fraction: if total > 0.0 { removed / total } else { 0.0 } })
 }
 
-/// Whether a triangle that no other one touches counts, from the winding number in front of its centre; behind it is one
-/// more. `None` if that might differ elsewhere on the triangle.
-fn verdict_by_one_point(corners: [DVec3; 3], front: f64, rim: &Rim) -> Option<bool> {
-    let center = (corners[0] + corners[1] + corners[2]) / 3.0;
-    let radius = corners.iter().map(|c| c.distance(center)).fold(0.0, f64::max);
-    let slope = rim.steepest(center, radius, 0.5 / radius.max(f64::MIN_POSITIVE))?;
-    let margin = WINDING_ERROR + slope * radius;
-    // Changes at front = −½ and ½.
-    ((front.abs() - 0.5).abs() > margin).then_some(front.abs() < 0.5)
+/// Whether triangles that no others touch count; `None` for the others, and where one point does not decide.
+fn verdicts_together(
+    whole: &impl Fn(u32) -> Piece,
+    triangles: &[[u32; 3]],
+    crossed: &[bool],
+    winding: &WindingNumber<'_>,
+    rim: &Rim,
+) -> Vec<Option<bool>> {
+    const NONE: u32 = u32::MAX;
+    // Over an edge of two triangles that agree on the outside one walks from front to front.
+    let mut neighbours = vec![[NONE; 3]; triangles.len()];
+    let uses = edge_uses(triangles);
+    for edge in by_edge(&uses) {
+        if let [a, b] = edge
+            && a.forward != b.forward
+        {
+            for (from, to) in [(a, b), (b, a)] {
+                if let Some(slot) = neighbours[from.triangle as usize].iter_mut().find(|slot| **slot == NONE) {
+                    *slot = to.triangle;
+                }
+            }
+        }
+    }
+    let mut verdicts = vec![None; triangles.len()];
+    let mut open = Vec::new();
+    for seed in 0..triangles.len() as u32 {
+        if crossed[seed as usize] || verdicts[seed as usize].is_some() {
+            continue;
+        }
+        let piece = whole(seed);
+        let center = piece.center();
+        let front = winding.at(piece.beside(1.0));
+        let own = piece.radius_about(center);
+        let widest = if rim.is_empty() { f64::MAX } else { TOGETHER.max(2.0 * own) };
+        // The verdict for all triangles within some distance, or at least for this one.
+        let decided = [widest, own].into_iter().find(|&radius| decides(front, center, radius, rim));
+        let Some(radius) = decided else { continue };
+        // Behind a triangle w is one more than in front: ½ lies between for |front| < ½.
+        let verdict = Some(front.abs() < 0.5);
+        verdicts[seed as usize] = verdict;
+        open.push(seed);
+        while let Some(t) = open.pop() {
+            for next in neighbours[t as usize] {
+                let free = next != NONE && !crossed[next as usize] && verdicts[next as usize].is_none();
+                if free && whole(next).radius_about(center) <= radius {
+                    verdicts[next as usize] = verdict;
+                    open.push(next);
+                }
+            }
+        }
+    }
+    verdicts
+}
+
+/// Whether the winding number in front of connected triangles within `radius` of `center` stays as far from ½ and −½, where
+/// their verdict changes, as `front` shows it to be.
+fn decides(front: f64, center: DVec3, radius: f64, rim: &Rim) -> bool {
+    let Some(slope) = rim.steepest(center, radius, 0.5 / radius.max(f64::MIN_POSITIVE)) else { return false };
+    (front.abs() - 0.5).abs() > WINDING_ERROR + slope * radius
 }
 
 /// Winding numbers beside each piece.
