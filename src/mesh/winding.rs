@@ -62,17 +62,14 @@ impl Moments {
     fn add(&mut self, n: DVec3, delta: DVec3) {
         self.dipole += n;
         self.first += outer(n, delta);
-        self.second.add(n, delta, delta, 1.0);
+        self.second.add(outer(delta, delta), n, 1.0);
     }
 
     /// Adds the moments of a child about its own centre, `shift` from this one.
     fn add_shifted(&mut self, child: &Self, shift: DVec3) {
         self.add(child.dipole, shift);
         self.first += child.first;
-        let DMat3 { x_axis, y_axis, z_axis } = child.first;
-        for (column, axis) in [(x_axis, DVec3::X), (y_axis, DVec3::Y), (z_axis, DVec3::Z)] {
-            self.second.add(column, axis, shift, 2.0);
-        }
+        self.second.add((child.first + child.first.transpose()) * 0.5, shift, 2.0);
         self.second.0.iter_mut().zip(child.second.0).for_each(|(a, b)| *a += b);
     }
 
@@ -141,11 +138,11 @@ impl Cubic {
     const INDICES: [[usize; 3]; 10] =
         [[0, 0, 0], [1, 1, 1], [2, 2, 2], [0, 0, 1], [0, 0, 2], [0, 1, 1], [1, 1, 2], [0, 2, 2], [1, 2, 2], [0, 1, 2]];
 
-    /// Adds `factor` times the symmetric part of a⊗b⊗c.
-    fn add(&mut self, a: DVec3, b: DVec3, c: DVec3, factor: f64) {
+    /// Adds `factor` times the symmetric part of m⊗v; `m` must be symmetric.
+    fn add(&mut self, m: DMat3, v: DVec3, factor: f64) {
+        let m = m.to_cols_array_2d();
         for (entry, [i, j, k]) in self.0.iter_mut().zip(Self::INDICES) {
-            let permutations = [(i, j, k), (i, k, j), (j, i, k), (j, k, i), (k, i, j), (k, j, i)];
-            *entry += factor / 6.0 * permutations.iter().map(|&(i, j, k)| a[i] * b[j] * c[k]).sum::<f64>();
+            *entry += factor / 3.0 * (m[i][j] * v[k] + m[j][k] * v[i] + m[k][i] * v[j]);
         }
     }
 }

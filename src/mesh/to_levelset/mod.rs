@@ -134,11 +134,9 @@ fn repair(
         None => Inside::Open(OpenInside { winding: &winding, rim: &rim }),
     };
     run.check(OPERATION)?;
-    let t0 = std::time::Instant::now();
     let pieces = separating_pieces(&clean.positions, &clean.triangles, &bvh, &winding, &rim, run)?;
     findings.removed_area_fraction = pieces.removed_area_fraction;
     run.check(OPERATION)?;
-    println!("  pieces {:?} kept {}", t0.elapsed(), pieces.kept.len());
     let all = DistanceLeaves::new(distances);
     let kept = if pieces.removed_area_fraction > 0.0 {
         distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?
@@ -148,7 +146,6 @@ fn repair(
     let mut kept = DistanceLeaves::new(kept);
     let mut surroundings = Surroundings::new(&inside, &winding, &all);
     let closure = surroundings.close(&kept, half_width, run)?;
-    println!("  close {:?}", t0.elapsed());
     findings.closure_triangles = closure.len();
     kept.merge(distance_to_triangles(closure.len(), |t| closure[t], half_width, run)?);
     let unsigned: Vec<_> = kept.origins().filter(|o| surroundings.mask(*o).is_none()).collect();
