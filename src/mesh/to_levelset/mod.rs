@@ -112,7 +112,7 @@ pub fn mesh_to_level_set(
     };
     let level_set = LevelSet::new(grid_of_leaves(background(params.half_width, &transform), leaves), transform);
     if !encloses_a_voxel(&level_set) {
-        return Err(encloses_nothing(&findings, params));
+        return Err(encloses_nothing(closed, &findings, params));
     }
     Ok((level_set, findings))
 }
@@ -262,8 +262,8 @@ fn nothing_left(mesh: &TriangleMesh, findings: &MeshFindings) -> EditError {
 }
 
 /// The error for a surface without a voxel inside.
-fn encloses_nothing(findings: &MeshFindings, params: &MeshToLevelSet) -> EditError {
-    if findings.converted.closed {
+fn encloses_nothing(closed: bool, findings: &MeshFindings, params: &MeshToLevelSet) -> EditError {
+    if closed {
         let accepted = "every part of the mesh is thinner than a voxel, so that no voxel is inside; take a smaller one";
         return EditError::parameter(OPERATION, "voxel_size", params.voxel_size, accepted);
     }

@@ -174,7 +174,7 @@ fn nasty_meshes_become_valid_level_sets_or_clear_errors() {
         ("negative_indices.obj", ""),
         ("nested_boxes.glb", ""),
         ("nested_shell_hollow.obj", ""),
-        ("nonmanifold_not_convex.obj", "12 edges have more than two triangles"),
+        ("nonmanifold_not_convex.obj", "thinner than a voxel"),
         ("openscad_nonmanifold.obj", "more than two triangles"),
         ("rabbit_overlapping_parts.obj", "pass through each other"),
         ("self_intersectA.obj", "pass through each other"),
@@ -193,7 +193,7 @@ fn nasty_meshes_become_valid_level_sets_or_clear_errors() {
         let (lo, hi) = mesh.bounding_box().unwrap();
         match convert(&mesh, (hi - lo).max_element() / 30.0) {
             Err(error) => {
-                if word.is_empty() || !error.to_string().contains(word) || error.exit_code() != 3 {
+                if word.is_empty() || !error.to_string().contains(word) || !matches!(error.exit_code(), 2 | 3) {
                     surprises.push(format!("{file}: {error}"));
                 }
             }
