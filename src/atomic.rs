@@ -8,6 +8,7 @@
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use tempfile::NamedTempFile;
 
@@ -64,6 +65,7 @@ fn replace(path: &Path, target: &Path, fill: impl FnOnce(&mut NamedTempFile) -> 
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     let mut file = builder.tempfile_in(folder).map_err(|e| failed(path, e))?;
+    let _unfinished = Unfinished::new(file.path());
     fill(&mut file)?;
     // Reopened by name: `produce` may have replaced the file by another one.
     let flushed = File::open(file.path()).and_then(|f| f.sync_all());
@@ -78,6 +80,33 @@ fn replace(path: &Path, target: &Path, fill: impl FnOnce(&mut NamedTempFile) -> 
         let _ = folder.sync_all();
     }
     Ok(())
+}
+
+/// Temporary files that are being filled.
+static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
+
+/// Notes a temporary file for as long as it lives, for [`remove_unfinished`].
+pub(crate) struct Unfinished(PathBuf);
+
+impl Unfinished {
+    pub(crate) fn new(path: &Path) -> Self {
+        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).push(path.into());
+        Self(path.into())
+    }
+}
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).retain(|path| *path != self.0);
+    }
+}
+
+/// Removes all temporary files that are being filled: for a process that is about to end without unwinding.
+pub fn remove_unfinished() {
+    for path in UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).drain(..) {
+        // One that has just been renamed is no longer there, and its target is complete.
+        let _ = fs::remove_file(path);
+    }
 }
 
 fn folder_of(target: &Path) -> &Path {

@@ -4,10 +4,16 @@
 //! library's argument, the options of the command and the keys of a recipe; its field documentation is the help. The
 //! command line and recipes find operators in [`REGISTRY`] and know nothing of any one of them.
 
+pub mod compare;
+pub mod csg;
+pub mod distance;
+pub mod morphology;
 mod params;
 mod registry;
+pub mod shape;
 pub mod smooth;
 mod solver;
+pub mod transform;
 
 pub use params::{Vector, VoxelLength, WorldLength};
 pub use registry::{Arity, Entry, Operator, Outcome, Parameter, REGISTRY, Summary, find};

@@ -65,10 +65,22 @@ macro_rules! length {
         #[derive(Clone, Copy, Debug, PartialEq)]
         pub struct $name(Quantity);
 
+        impl Default for $name {
+            /// Zero.
+            fn default() -> Self {
+                Self::new(0.0)
+            }
+        }
+
         impl $name {
             /// A length in the unit of bare numbers.
             pub const fn new(value: f64) -> Self {
                 Self(Quantity { value, unit: None })
+            }
+
+            /// One voxel, whatever its size.
+            pub const fn voxel() -> Self {
+                Self(Quantity { value: 1.0, unit: Some(Unit::Voxels) })
             }
 
             /// In world units.

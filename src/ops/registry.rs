@@ -177,7 +177,19 @@ impl Entry {
 }
 
 /// All operators, in the order of the manual.
-pub static REGISTRY: &[Entry] = &[Entry::of::<super::smooth::Smooth>()];
+pub static REGISTRY: &[Entry] = &[
+    Entry::of::<super::shape::Shape>(),
+    Entry::of::<super::transform::TransformOperator>(),
+    Entry::of::<super::csg::Csg>(),
+    Entry::of::<super::smooth::Smooth>(),
+    Entry::of::<super::morphology::Offset>(),
+    Entry::of::<super::morphology::Dilate>(),
+    Entry::of::<super::morphology::Erode>(),
+    Entry::of::<super::morphology::Open>(),
+    Entry::of::<super::morphology::Close>(),
+    Entry::of::<super::distance::RebuildDistance>(),
+    Entry::of::<super::distance::Renormalize>(),
+];
 
 /// The operator of a name.
 pub fn find(name: &str) -> Result<&'static Entry> {

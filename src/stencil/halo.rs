@@ -1,5 +1,7 @@
 //! A leaf and its rim in one contiguous buffer.
 
+use glam::IVec3;
+
 use crate::grid::{LeafValues, Neighbours, Paged};
 
 /// Eight voxels along z.
@@ -68,6 +70,13 @@ impl<const S: usize> Halo<S> {
         }
     }
 
+    /// The value at a voxel in the leaf's own coordinates, within the rim.
+    #[inline(always)]
+    pub fn value(&self, local: IVec3) -> f32 {
+        let at = |i: i32| (i + Self::RIM as i32) as usize;
+        self.0[at(local.x)][at(local.y)][at(local.z)]
+    }
+
     /// The 8 values of row (x, y) shifted by (dx, dy, dz) voxels, each shift within the rim.
     #[inline(always)]
     pub fn row(&self, x: usize, y: usize, [dx, dy, dz]: [isize; 3]) -> &Row {
@@ -110,7 +119,6 @@ impl<'a, const S: usize> Star<'a, S> {
 mod tests {
     use super::*;
     use crate::grid::{Grid, leaf_offset, offset_to_local};
-    use glam::IVec3;
 
     fn value(ijk: IVec3) -> f32 {
         (ijk.x * 1000 + ijk.y * 30 + ijk.z) as f32

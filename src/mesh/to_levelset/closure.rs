@@ -12,10 +12,10 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::inside::{APART, Inside};
-use super::scatter::UnsignedLeaf;
 use crate::error::Result;
 use crate::grid::{LEAF_DIM, LeafMask, LeafValues, leaf_offset, leaf_origin};
 use crate::mesh::WindingNumber;
+use crate::mesh::scatter::UnsignedLeaf;
 use crate::run::RunOptions;
 
 const AXES: [IVec3; 3] = [IVec3::X, IVec3::Y, IVec3::Z];

@@ -196,8 +196,8 @@ fn offset_in(i: i32, edge: i32) -> IVec3 {
 mod tests {
     use super::*;
     use crate::mesh::Bvh;
+    use crate::mesh::scatter::distance_to_triangles;
     use crate::mesh::testing::*;
-    use crate::mesh::to_levelset::scatter::distance_to_triangles;
     use crate::run::RunOptions;
 
     #[test]

@@ -13,7 +13,6 @@ mod crossings;
 mod inside;
 mod intersect;
 mod pieces;
-mod scatter;
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -22,10 +21,9 @@ use closure::{DistanceLeaves, Surroundings};
 use crossings::Crossings;
 use inside::{Inside, OpenInside, Rim};
 use pieces::separating_pieces;
-use scatter::estimated_bytes;
-pub use scatter::{UnsignedLeaf, distance_to_triangles};
 
 use super::prepare::prepare;
+use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes};
 use super::topology::{boundary_chain, edge_uses};
 use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber};
 use crate::error::{EditError, Result};

@@ -1,0 +1,46 @@
+// Shared by the translation units that do see OpenVDB.
+#pragma once
+
+#include "bridge.h"
+#include "vdb-edit/src/vdb/bridge.rs.h"
+
+#include <openvdb/openvdb.h>
+
+#include <iostream>
+#include <mutex>
+#include <vector>
+
+namespace vdb_edit {
+
+using LeafNode = openvdb::FloatTree::LeafNodeType;
+
+struct FloatGrid::Impl {
+    openvdb::FloatGrid::Ptr grid;
+    std::vector<LeafNode*> leaves; // in the order they were added; owned by the tree
+};
+
+inline std::unique_ptr<FloatGrid> wrap(openvdb::FloatGrid::Ptr grid)
+{
+    auto impl = std::make_unique<FloatGrid::Impl>();
+    impl->grid = std::move(grid);
+    return std::make_unique<FloatGrid>(std::move(impl));
+}
+
+/// An empty float grid. Made through the registry: FloatGrid::create() would instantiate every virtual function of the
+/// tree here, which costs 12 to 15 s of compilation.
+openvdb::FloatGrid::Ptr make_float_grid(double background);
+
+/// The linear transform of a row-major 4x4 matrix that acts on columns.
+openvdb::math::Transform::Ptr linear_transform(rust::Slice<const double> matrix);
+
+/// While one exists, what OpenVDB prints goes to the log that `take_log` returns. Debian's library logs warnings through
+/// log4cplus to std::cout, which would break programs whose standard output is data; its headers log to std::cerr.
+class QuietOutput {
+public:
+    QuietOutput();
+    ~QuietOutput();
+    QuietOutput(const QuietOutput&) = delete;
+    QuietOutput& operator=(const QuietOutput&) = delete;
+};
+
+} // namespace vdb_edit

@@ -1,0 +1,92 @@
+//! `convert`: meshes to level sets, level sets to meshes, and either to another file of its kind.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use clap::builder::ValueParser;
+use clap::{Arg, ArgMatches, Command};
+use serde_json::{Map, Value, json};
+
+use super::context::Context;
+use super::edit::{self, Edit};
+use super::input::{self, InputOptions};
+use super::output::{Output, Written};
+use super::preview::Preview;
+use super::{Verb, args, options};
+use crate::error::{EditError, Result};
+use crate::mesh::MeshFormat;
+use crate::ops::{Summary, WorldLength};
+
+/// The command.
+pub const VERB: Verb = Verb { name: "convert", build, run };
+
+fn build(command: Command) -> Command {
+    let command = command
+        .about("Turn meshes into level sets, level sets into meshes, and either into another file of its kind")
+        .long_about(
+            "Turn meshes into level sets, level sets into meshes, and either into another file of its kind.\n\n\
+             A mesh becomes a mesh directly, unless a voxel size or resolution is given: then by way of a level set.",
+        )
+        .arg(args::path("input").value_name("IN").required(true).help("A .vdb, a mesh, or `-`"))
+        .arg(
+            Arg::new("iso")
+                .long("iso")
+                .value_name("LENGTH")
+                .allow_hyphen_values(true)
+                .value_parser(ValueParser::new(options::length))
+                .help(
+                    "To meshes: the surface at this distance, positive outside, in world units (or `1vx`) [default: 0]",
+                ),
+        );
+    args::output(args::conversion(args::grids(command), |_| false))
+}
+
+fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
+    let began = Instant::now();
+    let paths: Vec<PathBuf> = args::paths(matches, "input");
+    let Some(path) = paths.first() else { return Ok(()) };
+    let input_options = InputOptions::new(matches)?;
+    let output = Output::plan(matches, context)?;
+    let preview = Preview::plan(matches)?;
+    let iso = matches.get_one::<Value>("iso").cloned();
+    if iso.is_some() && !output.is_mesh() {
+        let accepted = "an output that is a mesh; `offset` moves the surface of a level set";
+        return Err(EditError::parameter("convert", "iso", output.path.display(), accepted));
+    }
+    if args::flag(matches, "dry-run") {
+        let lines = input::probe(&paths, &input_options)?;
+        return edit::dry_run("convert", Map::new(), &lines, &output, context);
+    }
+    if MeshFormat::of(path).is_some() && output.is_mesh() && !input_options.has_size() && iso.is_none() {
+        return mesh_to_mesh(path, &output, began, context);
+    }
+    let mut warnings = Vec::new();
+    let inputs = input::load(&paths, &input_options, &mut warnings, context)?;
+    let Some(level_set) = inputs.first().map(|input| input.level_set.clone()) else { return Ok(()) };
+    let iso = match iso.map(serde_json::from_value::<WorldLength>) {
+        Some(Ok(length)) => length.world(level_set.voxel_size()) as f32,
+        _ => 0.0,
+    };
+    let summary = Summary { warnings, ..Summary::default() };
+    let edit = Edit { operation: "convert", inputs, level_set, summary, iso, began };
+    edit.finish(&output, &preview, args::flag(matches, "check"), context)
+}
+
+/// The same mesh in another format.
+fn mesh_to_mesh(path: &std::path::Path, output: &Output, began: Instant, context: &Context) -> Result<()> {
+    let mut warnings = Vec::new();
+    let mesh = input::read_mesh(path, &mut warnings)?;
+    let Written { bytes, .. } = output.write_mesh(&mesh)?;
+    for warning in &warnings {
+        context.reporter.warn(warning);
+    }
+    let (vertices, triangles) = (mesh.positions.len(), mesh.triangles.len());
+    let seconds = began.elapsed().as_secs_f64();
+    let value = json!({
+        "operation": "convert", "inputs": [path.display().to_string()], "output": output.path.display().to_string(),
+        "bytes": bytes, "seconds": seconds, "vertices": vertices, "triangles": triangles, "warnings": warnings,
+    });
+    context.reporter.result(&value, || {
+        format!("{}: {vertices} vertices, {triangles} triangles in {seconds:.2} s\n", output.path.display())
+    })
+}

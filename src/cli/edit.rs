@@ -1,0 +1,231 @@
+//! Running an operator: read, apply, verify, write, tell what changed.
+
+use std::time::Instant;
+
+use clap::ArgMatches;
+use serde_json::{Map, Value, json};
+
+use super::context::Context;
+use super::input::{self, Input, InputOptions};
+use super::output::{Output, Written};
+use super::preview::Preview;
+use super::{args, options, table};
+use crate::error::{EditError, Result};
+use crate::levelset::{LevelSet, Measures};
+use crate::ops::compare::changed_voxels;
+use crate::ops::{Arity, Entry, Outcome, Summary};
+
+/// Runs an operator as its command asks.
+pub fn run(entry: &Entry, matches: &ArgMatches, context: &Context) -> Result<()> {
+    let began = Instant::now();
+    let values = options::collect(entry, matches);
+    entry.check(values.clone())?;
+    let paths = args::paths(matches, "input");
+    let input_options = InputOptions::new(matches)?;
+    let output = Output::plan(matches, context)?;
+    let preview = Preview::plan(matches)?;
+    if args::flag(matches, "dry-run") {
+        return dry_run(entry.name, values, &input::probe(&paths, &input_options)?, &output, context);
+    }
+    let mut warnings = Vec::new();
+    let inputs = match entry.arity {
+        Arity::Source => Vec::new(),
+        Arity::One | Arity::Many => input::load(&paths, &input_options, &mut warnings, context)?,
+    };
+    let level_sets = inputs.iter().map(|input| input.level_set.clone()).collect();
+    let Outcome { level_set, mut summary } = entry.run(values, level_sets, &context.run)?;
+    warnings.append(&mut summary.warnings);
+    summary.warnings = warnings;
+    let edit = Edit { operation: entry.name, inputs, level_set, summary, iso: 0.0, began };
+    edit.finish(&output, &preview, args::flag(matches, "check"), context)
+}
+
+/// Says what would be done.
+pub fn dry_run(
+    operation: &str,
+    values: Map<String, Value>,
+    inputs: &[String],
+    output: &Output,
+    context: &Context,
+) -> Result<()> {
+    let path = output.path.display().to_string();
+    let value = json!({
+        "dry_run": true, "operation": operation, "parameters": values, "inputs": inputs, "output": path,
+    });
+    context.reporter.result(&value, || {
+        let inputs: String = inputs.iter().map(|line| format!("  reads {line}\n")).collect();
+        let values: String = values.iter().map(|(name, value)| format!("  {name} = {value}\n")).collect();
+        let verb = if output.path.exists() { "would replace" } else { "would write" };
+        format!("{operation} would run; nothing is written\n{values}{inputs}  {verb} {path}\n")
+    })
+}
+
+/// An edit that was computed and is not yet written.
+pub struct Edit {
+    /// What was done.
+    pub operation: &'static str,
+    /// To what; the first one counts as "before".
+    pub inputs: Vec<Input>,
+    /// The result.
+    pub level_set: LevelSet,
+    /// What the operator has to say.
+    pub summary: Summary,
+    /// The surface that a mesh is made of.
+    pub iso: f32,
+    /// When the command began.
+    pub began: Instant,
+}
+
+impl Edit {
+    /// What the result is compared with: the first input, but for a conversion only if it was a level set already.
+    fn before(&self) -> Option<&LevelSet> {
+        let input = self.inputs.first()?;
+        (self.converts_nothing() || input.source.is_some()).then_some(&input.level_set)
+    }
+
+    fn converts_nothing(&self) -> bool {
+        self.operation != super::convert::VERB.name
+    }
+
+    /// Verifies, draws and writes the result, then tells what changed.
+    pub fn finish(self, output: &Output, preview: &Preview, check: bool, context: &Context) -> Result<()> {
+        let before = self.before();
+        let facts = Facts {
+            before: before.map(|level_set| level_set.measure(&context.run)).transpose()?,
+            after: self.level_set.measure(&context.run)?,
+            voxels_changed: changed_voxels(before, &self.level_set),
+        };
+        if check {
+            verify(self.operation, &self.level_set)?;
+        }
+        preview.write(before, &self.level_set, context)?;
+        let from = self.inputs.iter().find_map(Input::from);
+        let Written { bytes, warnings } = output.write(&self.level_set, self.iso, from, context)?;
+        let mut summary = self.summary.clone();
+        summary.warnings.extend(warnings);
+        for warning in &summary.warnings {
+            context.reporter.warn(warning);
+        }
+        let report = Report { edit: &self, facts: &facts, summary: &summary, bytes, output };
+        if output.is_pipe() {
+            context.reporter.result_beside_output(|| report.text());
+            return Ok(());
+        }
+        context.reporter.result(&report.json(), || report.text())
+    }
+}
+
+/// Refuses a result that is no valid level set.
+fn verify(operation: &str, level_set: &LevelSet) -> Result<()> {
+    let violations = level_set.check();
+    if violations.is_empty() {
+        return Ok(());
+    }
+    let said: Vec<String> = violations.iter().map(ToString::to_string).collect();
+    let problem = format!("--check: the result is not written: {}", said.join("; "));
+    Err(EditError::Unmet { operation: operation.into(), problem })
+}
+
+struct Facts {
+    before: Option<Measures>,
+    after: Measures,
+    voxels_changed: u64,
+}
+
+/// What is told of an edit.
+struct Report<'a> {
+    edit: &'a Edit,
+    facts: &'a Facts,
+    summary: &'a Summary,
+    bytes: Option<u64>,
+    output: &'a Output,
+}
+
+impl Report<'_> {
+    fn json(&self) -> Value {
+        let Self { edit, facts, summary, bytes, output } = self;
+        let Facts { before, after, voxels_changed } = facts;
+        let inputs: Vec<String> = edit.inputs.iter().map(|input| input.path.display().to_string()).collect();
+        let bounds = edit.level_set.world_bounds().map(|(lo, hi)| [lo.to_array(), hi.to_array()]);
+        let mut object = json!({
+            "operation": edit.operation,
+            "inputs": inputs,
+            "output": output.path.display().to_string(),
+            "bytes": bytes,
+            "seconds": edit.began.elapsed().as_secs_f64(),
+            "steps": summary.steps,
+            "stopped_because": summary.stopped_because,
+            "voxels_changed": voxels_changed,
+            "active_voxels": edit.level_set.grid().active_voxels(),
+            "voxel_size": edit.level_set.voxel_size(),
+            "half_width": edit.level_set.half_width(),
+            "bbox_world": bounds,
+            "volume_before": before.map(|m| m.volume),
+            "volume_after": after.volume,
+            "area_before": before.map(|m| m.area),
+            "area_after": after.area,
+            "components_before": before.map(|m| m.components),
+            "components_after": after.components,
+            "warnings": summary.warnings,
+        });
+        if let Some(object) = object.as_object_mut() {
+            for (name, value) in &summary.details {
+                object.entry(name.clone()).or_insert_with(|| value.clone());
+            }
+        }
+        object
+    }
+
+    fn text(&self) -> String {
+        let Self { edit, facts, summary, bytes, output } = self;
+        let Facts { before, after, voxels_changed } = facts;
+        let size = bytes.map(|bytes| format!(", {}", super::size::shown(bytes))).unwrap_or_default();
+        let mut text = format!(
+            "{}: {} in {:.2} s{size}\n",
+            output.path.display(),
+            edit.operation,
+            edit.began.elapsed().as_secs_f64()
+        );
+        // A conversion that changed nothing needs no second column.
+        let before = before.as_ref().filter(|before| *voxels_changed > 0 || *before != after);
+        let row = |name: &str, of: fn(&Measures) -> f64| {
+            let mut row = vec![name.to_owned()];
+            row.extend(before.map(|before| table::number(of(before))));
+            row.push(table::number(of(after)));
+            row.extend(before.map(|before| table::change(of(before), of(after))));
+            row
+        };
+        let whole = |name: &str, of: fn(&Measures) -> i64| {
+            let mut row = vec![name.to_owned()];
+            row.extend(before.map(|before| of(before).to_string()));
+            row.push(of(after).to_string());
+            row
+        };
+        let heading = before.map(|_| ["", "before", "after", "change"].map(str::to_owned).to_vec());
+        let rows = [
+            row("volume (world units³)", |m| m.volume),
+            row("area (world units²)", |m| m.area),
+            whole("components", |m| m.components as i64),
+            whole("Euler number", |m| m.euler),
+        ];
+        text += &table::columns(heading.into_iter().chain(rows));
+        let changed = match voxels_changed {
+            0 => "no voxel changed".into(),
+            n => format!("{} voxels changed", table::count(*n)),
+        };
+        text += &format!(
+            "  {changed}; {} active voxels of {} world units\n",
+            table::count(edit.level_set.grid().active_voxels()),
+            table::number(edit.level_set.voxel_size())
+        );
+        if let Some(steps) = summary.steps {
+            let reason = summary.stopped_because.as_ref().map(|reason| format!(": {reason}")).unwrap_or_default();
+            let plural = if steps == 1 { "" } else { "s" };
+            text += &format!("  {steps} step{plural}{reason}\n");
+        }
+        for (name, value) in &summary.details {
+            text += &format!("  {}: {value}\n", name.replace('_', " "));
+        }
+        text
+    }
+}

@@ -1,0 +1,90 @@
+//! The command: words become operators, results become tables or JSON, errors become one line and an exit code.
+//!
+//! Operators are found in the registry and get their options from their parameters: a new one needs nothing here. The
+//! verbs that are no operators ([`Verb`]) have a file each. What is said to the user goes through [`report`], and nothing
+//! below this module prints.
+
+mod app;
+mod args;
+mod compare;
+mod completions;
+mod context;
+mod convert;
+mod edit;
+mod info;
+mod input;
+mod options;
+mod output;
+mod preview;
+mod progress;
+mod render;
+mod report;
+mod signal;
+mod size;
+mod table;
+#[cfg(feature = "openvdb")]
+mod volume;
+#[cfg(not(feature = "openvdb"))]
+#[path = "volume_absent.rs"]
+mod volume;
+
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+use clap::{ArgMatches, Command};
+
+use crate::error::{EditError, Result};
+use crate::ops;
+use context::Context;
+use report::{Format, Reporter};
+
+/// A subcommand that is no operator.
+struct Verb {
+    name: &'static str,
+    /// Its arguments, without the ones that every command has.
+    build: fn(Command) -> Command,
+    run: fn(&ArgMatches, &Context) -> Result<()>,
+}
+
+/// All of them, in the order of the help.
+const VERBS: &[Verb] =
+    &[info::VERB, convert::VERB, compare::VERB, render::VERB, completions::COMPLETIONS, completions::MAN];
+
+/// Runs the command with the arguments of the process.
+pub fn main() -> ExitCode {
+    report::no_backtraces();
+    let arguments: Vec<OsString> = std::env::args_os().collect();
+    let matches = match app::command().try_get_matches_from(&arguments) {
+        Ok(matches) => matches,
+        Err(error) => return report::usage(&error, Format::guess(&arguments)),
+    };
+    let Some((name, matches)) = matches.subcommand() else { return ExitCode::from(2) };
+    let reporter = Reporter::new(matches);
+    let result = Context::new(matches, reporter.clone()).and_then(|context| {
+        signal::watch(&context.run)?;
+        let result = dispatch(name, matches, &context);
+        context.finish();
+        result
+    });
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            // A cancelled run says which signal it was.
+            let cancelled = matches!(error, EditError::Cancelled { .. });
+            let code = signal::exit_code().filter(|_| cancelled).unwrap_or(error.exit_code());
+            reporter.error(&error, code);
+            ExitCode::from(code)
+        }
+    }
+}
+
+fn dispatch(name: &str, matches: &ArgMatches, context: &Context) -> Result<()> {
+    if let Some(verb) = VERBS.iter().find(|verb| verb.name == name) {
+        return (verb.run)(matches, context);
+    }
+    let entry = ops::REGISTRY.iter().find(|entry| options::kebab(entry.name) == name);
+    match entry {
+        Some(entry) => edit::run(entry, matches, context),
+        None => Err(EditError::parameter("vdb-edit", "command", name, "a command of `vdb-edit --help`")),
+    }
+}

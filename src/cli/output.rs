@@ -1,0 +1,141 @@
+//! Where a result goes: settled before any work, written at its end.
+
+use std::path::{Path, PathBuf};
+
+use clap::ArgMatches;
+
+use super::context::Context;
+use super::volume::{self, Volume};
+use super::{args, input};
+use crate::error::{EditError, Result};
+use crate::levelset::LevelSet;
+use crate::mesh::{self, MeshFormat, level_set_to_mesh};
+
+/// A file to be written.
+pub struct Output {
+    /// Its path; `-` is standard output.
+    pub path: PathBuf,
+    kind: Kind,
+    options: VolumeOptions,
+}
+
+/// What it will hold.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Kind {
+    Volume,
+    Mesh,
+}
+
+/// How a `.vdb` is written.
+#[derive(Clone, Debug, Default)]
+pub struct VolumeOptions {
+    /// `--precision`: whether half; `None` keeps that of the input.
+    pub half: Option<bool>,
+    /// `--compression`; `None` keeps that of the input.
+    pub compression: Option<String>,
+    /// `--only-result`.
+    pub only_result: bool,
+}
+
+/// What was written.
+#[derive(Default)]
+pub struct Written {
+    /// Size of the file, where it is known.
+    pub bytes: Option<u64>,
+    /// What is not as asked.
+    pub warnings: Vec<String>,
+}
+
+impl Output {
+    /// The output of a command, refused now if it could not be written later.
+    pub fn plan(matches: &ArgMatches, context: &Context) -> Result<Self> {
+        let path = matches.get_one::<PathBuf>("output").cloned().unwrap_or_default();
+        let kind = kind_of(&path)?;
+        if input::is_pipe(&path) && context.reporter.wants_json() {
+            let accepted = "a file: standard output takes either the .vdb or the --json result";
+            return Err(EditError::parameter("vdb-edit", "output", "-", accepted));
+        }
+        writable(&path)?;
+        let word = |id: &str| matches.get_one::<String>(id).cloned();
+        let options = VolumeOptions {
+            half: word("precision").map(|word| word == "half"),
+            compression: word("compression"),
+            only_result: args::flag(matches, "only-result"),
+        };
+        Ok(Self { path, kind, options })
+    }
+
+    /// Whether it is a mesh.
+    pub fn is_mesh(&self) -> bool {
+        self.kind == Kind::Mesh
+    }
+
+    /// Whether it is standard output.
+    pub fn is_pipe(&self) -> bool {
+        input::is_pipe(&self.path)
+    }
+
+    /// Writes a level set; the surface `iso` of it where a mesh is wanted. `from` is the grid that it was made from.
+    pub fn write(
+        &self,
+        level_set: &LevelSet,
+        iso: f32,
+        from: Option<(&Volume, usize)>,
+        context: &Context,
+    ) -> Result<Written> {
+        context.run.check("writing")?;
+        match self.kind {
+            Kind::Volume => {
+                let (bytes, warnings) = volume::write(&self.path, level_set, from, &self.options)?;
+                Ok(Written { bytes: Some(bytes), warnings })
+            }
+            Kind::Mesh => {
+                let mesh = level_set_to_mesh(level_set, iso, &context.run)?;
+                self.write_mesh(&mesh)
+            }
+        }
+    }
+
+    /// Writes a mesh as it is.
+    pub fn write_mesh(&self, mesh: &mesh::TriangleMesh) -> Result<Written> {
+        mesh::write(&self.path, mesh)?;
+        Ok(Written { bytes: std::fs::metadata(&self.path).ok().map(|m| m.len()), warnings: Vec::new() })
+    }
+}
+
+fn kind_of(path: &Path) -> Result<Kind> {
+    if input::is_volume(path) {
+        Ok(Kind::Volume)
+    } else if MeshFormat::of(path).is_some() {
+        Ok(Kind::Mesh)
+    } else {
+        let accepted = format!("a file name that ends in {}, or `-`", input::EXTENSIONS);
+        Err(EditError::parameter("vdb-edit", "output", path.display(), accepted))
+    }
+}
+
+/// Refuses a path at which nothing can be written, by making a temporary file beside it.
+pub fn writable(path: &Path) -> Result<()> {
+    if input::is_pipe(path) {
+        return Ok(());
+    }
+    match std::fs::metadata(path) {
+        Ok(facts) if facts.is_dir() => return Err(EditError::output(path, "it is a folder; a file name is wanted")),
+        Ok(facts) if !facts.is_file() => return Ok(()),
+        Ok(facts) if facts.permissions().readonly() => {
+            return Err(EditError::output(path, "the existing file is read-only"));
+        }
+        _ => {}
+    }
+    // Through links: the file that they name is the one that is replaced.
+    let real = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_path_buf());
+    let folder = match real.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    if !folder.is_dir() {
+        return Err(EditError::output(path, format!("there is no folder `{}`", folder.display())));
+    }
+    let probe = tempfile::Builder::new().prefix(".vdb-edit-").tempfile_in(folder);
+    probe.map(drop).map_err(|e| EditError::output(path, format!("no file can be made in `{}`: {e}", folder.display())))
+}

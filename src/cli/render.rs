@@ -1,0 +1,265 @@
+//! `render`: a picture of a level set.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use clap::builder::ValueParser;
+use clap::{Arg, ArgAction, ArgMatches, Command, value_parser};
+use serde_json::{Map, json};
+
+use super::context::Context;
+use super::input::{self, InputOptions};
+use super::{Verb, args, output};
+use crate::atomic::write_atomically;
+use crate::error::{EditError, Result};
+use crate::levelset::LevelSet;
+use crate::region::{Region, parse_regions};
+use crate::render::{CameraSpec, ColorBy, Frame, Image, RenderOptions, UpAxis, render};
+
+/// The command.
+pub const VERB: Verb = Verb { name: "render", build, run };
+
+/// `--color-by`.
+#[derive(Clone, Debug, PartialEq)]
+enum Color {
+    Clay,
+    Curvature,
+    Normal,
+    Region,
+    Difference(PathBuf),
+}
+
+fn build(command: Command) -> Command {
+    let option = |id: &'static str, value_name: &'static str| Arg::new(id).long(id).value_name(value_name);
+    let command = command
+        .about("Draw a picture of a level set or mesh")
+        .arg(args::path("input").value_name("IN").required(true).help("A .vdb, a mesh, or `-`"))
+        .arg(args::path("output").long("output").short('o').value_name("OUT.png").required(true).help("The picture"))
+        .arg(
+            option("color-by", "WHAT")
+                .value_parser(ValueParser::new(color))
+                .help("clay, curvature, normal, region (with --region) or difference:OTHER [default: clay]"),
+        )
+        .arg(
+            option("region", "SPEC")
+                .action(ArgAction::Append)
+                .help("The region that --color-by region shows; several multiply, `or SPEC` and `not SPEC` combine"),
+        )
+        .arg(
+            option("size", "WxH")
+                .value_parser(ValueParser::new(picture_size))
+                .help("Width and height in pixels [default: 1280x960]"),
+        )
+        .arg(
+            option("camera", "AZIMUTH,ELEVATION[,FOV]")
+                .allow_hyphen_values(true)
+                .value_parser(ValueParser::new(camera))
+                .help(
+                    "Where from, in degrees: around the up axis, above the horizon, field of view [default: 35,20,28]",
+                ),
+        )
+        .arg(
+            option("up", "y|z")
+                .value_parser(["y", "z"])
+                .hide_possible_values(true)
+                .help("The axis that points up [default: y]"),
+        )
+        .arg(
+            option("range", "NUMBER").value_parser(value_parser!(f64)).help(
+                "Where colours saturate: curvature in 1/voxel [default: 0.125], difference in voxels [default: 1]",
+            ),
+        )
+        .arg(
+            option("turntable", "N")
+                .value_parser(value_parser!(u32).range(1..=10_000))
+                .help("N pictures once around: #### in OUT.png becomes the number, or it is put before the ending"),
+        )
+        .arg(option("transparent", "").num_args(0).action(ArgAction::SetTrue).help("Leave the background transparent"))
+        .arg(
+            option("dry-run", "").num_args(0).action(ArgAction::SetTrue).help("Say what would be done; write nothing"),
+        );
+    args::conversion(args::grids(command), |_| false)
+}
+
+fn color(text: &str) -> Result<Color, String> {
+    Ok(match text {
+        "clay" => Color::Clay,
+        "curvature" => Color::Curvature,
+        "normal" => Color::Normal,
+        "region" => Color::Region,
+        _ => match text.strip_prefix("difference:") {
+            Some(other) if !other.is_empty() => Color::Difference(other.into()),
+            _ => return Err("there are clay, curvature, normal, region and difference:OTHER".into()),
+        },
+    })
+}
+
+fn picture_size(text: &str) -> Result<[u32; 2], String> {
+    let size = text.split_once(['x', 'X']).and_then(|(w, h)| Some([w.trim().parse().ok()?, h.trim().parse().ok()?]));
+    size.ok_or_else(|| "width and height such as 1280x960 are wanted".into())
+}
+
+fn camera(text: &str) -> Result<CameraSpec, String> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
+    let spec = CameraSpec::default();
+    match numbers.as_deref() {
+        Some(&[azimuth, elevation]) => Ok(CameraSpec { azimuth, elevation, ..spec }),
+        Some(&[azimuth, elevation, field_of_view]) => Ok(CameraSpec { azimuth, elevation, field_of_view, ..spec }),
+        _ => Err("degrees such as 35,20 or 35,20,28 are wanted".into()),
+    }
+}
+
+fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
+    let began = Instant::now();
+    let paths = args::paths(matches, "input");
+    let path = matches.get_one::<PathBuf>("output").cloned().unwrap_or_default();
+    is_png(&path, "output")?;
+    output::writable(&path)?;
+    let input_options = InputOptions::new(matches)?;
+    let options = options(matches);
+    options.validate()?;
+    let color = matches.get_one::<Color>("color-by").cloned().unwrap_or(Color::Clay);
+    let specs: Vec<String> = matches.get_many("region").map(|specs| specs.cloned().collect()).unwrap_or_default();
+    let region = parse_regions(&specs)?;
+    if (color == Color::Region) != region.is_some() {
+        let accepted = "`--color-by region` and one or more `--region SPEC` go together";
+        return Err(EditError::parameter("render", "color_by", format!("{color:?}").to_lowercase(), accepted));
+    }
+    let frames = frames(&path, matches.get_one::<u32>("turntable").copied());
+    if args::flag(matches, "dry-run") {
+        let mut all = paths;
+        all.extend(color.other());
+        let lines = input::probe(&all, &input_options)?;
+        let names: Vec<String> = frames.iter().map(|(path, _)| path.display().to_string()).collect();
+        let value = json!({ "dry_run": true, "operation": "render", "inputs": lines, "outputs": names });
+        return context.reporter.result(&value, || format!("would draw {}\n", names.join(", ")));
+    }
+    let mut all = paths;
+    all.extend(color.other());
+    let mut warnings = Vec::new();
+    let inputs = input::load(&all, &input_options, &mut warnings, context)?;
+    warnings.iter().for_each(|warning| context.reporter.warn(warning));
+    let Some(input) = inputs.first() else { return Ok(()) };
+    let color_by = color.of(inputs.get(1).map(|input| &input.level_set), region.as_deref());
+    for (path, turn) in &frames {
+        let mut options = options.clone();
+        options.camera.azimuth += turn;
+        if frames.len() > 1 {
+            options.camera.frame = Frame::Sphere;
+        }
+        write(path, &render(&input.level_set, &color_by, &options, &context.run)?)?;
+    }
+    let names: Vec<String> = frames.iter().map(|(path, _)| path.display().to_string()).collect();
+    let seconds = began.elapsed().as_secs_f64();
+    let mut value = Map::new();
+    value.insert("operation".into(), "render".into());
+    value.insert("output".into(), names.first().cloned().into());
+    value.insert("outputs".into(), names.clone().into());
+    value.insert("width".into(), options.width.into());
+    value.insert("height".into(), options.height.into());
+    value.insert("seconds".into(), seconds.into());
+    value.insert("warnings".into(), warnings.into());
+    context.reporter.result(&value.into(), || {
+        format!("{}: {} x {} pixels in {seconds:.2} s\n", names.join(", "), options.width, options.height)
+    })
+}
+
+impl Color {
+    /// The file of the other surface.
+    fn other(&self) -> Option<PathBuf> {
+        match self {
+            Self::Difference(path) => Some(path.clone()),
+            _ => None,
+        }
+    }
+
+    fn of<'a>(&self, other: Option<&'a LevelSet>, region: Option<&'a dyn Region>) -> ColorBy<'a> {
+        match (self, other, region) {
+            (Self::Difference(_), Some(other), _) => ColorBy::Difference(other),
+            (Self::Region, _, Some(region)) => ColorBy::Region(region),
+            (Self::Curvature, ..) => ColorBy::Curvature,
+            (Self::Normal, ..) => ColorBy::Normal,
+            _ => ColorBy::Clay,
+        }
+    }
+}
+
+fn options(matches: &ArgMatches) -> RenderOptions {
+    let mut options = RenderOptions::default();
+    if let Some(&[width, height]) = matches.get_one::<[u32; 2]>("size") {
+        (options.width, options.height) = (width, height);
+    }
+    if let Some(camera) = matches.get_one::<CameraSpec>("camera") {
+        options.camera = *camera;
+    }
+    if matches.get_one::<String>("up").is_some_and(|axis| axis == "z") {
+        options.camera.up = UpAxis::Z;
+    }
+    options.range = matches.get_one("range").copied();
+    options.transparent_background = args::flag(matches, "transparent");
+    options
+}
+
+/// The pictures of a command: file and degrees of turn.
+fn frames(path: &Path, turntable: Option<u32>) -> Vec<(PathBuf, f64)> {
+    let Some(count) = turntable else { return vec![(path.to_path_buf(), 0.0)] };
+    let frame = |n: u32| (numbered(path, n + 1), 360.0 * f64::from(n) / f64::from(count));
+    (0..count).map(frame).collect()
+}
+
+/// The path of a frame: its number in the place of `####`, or before the ending.
+fn numbered(path: &Path, frame: u32) -> PathBuf {
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let name = match name.find('#') {
+        Some(start) => {
+            let width = name[start..].chars().take_while(|c| *c == '#').count();
+            format!("{}{frame:0width$}{}", &name[..start], &name[start + width..])
+        }
+        None => match name.rsplit_once('.') {
+            Some((stem, ending)) => format!("{stem}.{frame:04}.{ending}"),
+            None => format!("{name}.{frame:04}"),
+        },
+    };
+    path.with_file_name(name)
+}
+
+/// Refuses what is no `.png`.
+pub fn is_png(path: &Path, field: &str) -> Result<()> {
+    let png = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
+    let device = || std::fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir());
+    if png || device() {
+        return Ok(());
+    }
+    Err(EditError::parameter("render", field, path.display(), "a file name that ends in .png"))
+}
+
+/// Writes a picture, whole or not at all.
+pub fn write(path: &Path, image: &Image) -> Result<()> {
+    write_atomically(path, |out| image.write_png(out))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_are_understood() {
+        assert_eq!(picture_size("640x480"), Ok([640, 480]));
+        assert!(picture_size("640").is_err() && picture_size("-1x5").is_err());
+        assert_eq!(camera("-30, 10").map(|c| (c.azimuth, c.elevation)), Ok((-30.0, 10.0)));
+        assert_eq!(camera("1,2,3").map(|c| c.field_of_view), Ok(3.0));
+        assert!(camera("1").is_err() && camera("a,b").is_err());
+        assert_eq!(color("difference:a.vdb"), Ok(Color::Difference("a.vdb".into())));
+        assert!(color("difference:").is_err() && color("colour").is_err());
+    }
+
+    #[test]
+    fn frames_are_numbered() {
+        let name = |path: &str, n| numbered(Path::new(path), n).display().to_string();
+        assert_eq!(name("out/turn.####.png", 7), "out/turn.0007.png");
+        assert_eq!(name("turn##.png", 123), "turn123.png");
+        assert_eq!(name("turn.png", 7), "turn.0007.png");
+        let turns: Vec<f64> = frames(Path::new("a.png"), Some(4)).into_iter().map(|f| f.1).collect();
+        assert_eq!(turns, [0.0, 90.0, 180.0, 270.0]);
+    }
+}

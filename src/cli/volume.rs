@@ -1,0 +1,219 @@
+//! The command's view of `.vdb` files: one open file, its level sets, and what it says of itself.
+
+use std::path::Path;
+
+use glam::DVec3;
+use serde_json::{Map, Value, json};
+
+use super::output::VolumeOptions;
+use crate::error::{EditError, Result};
+use crate::levelset::LevelSet;
+use crate::run::RunOptions;
+use crate::vdb::{
+    Band, Compression, GridListing, GridToWrite, MetaItem, Precision, ReadLevelSet, VdbFile, WriteOptions,
+};
+
+/// The name of a level set that had none: what Houdini and Blender call a surface.
+const NEW_NAME: &str = "surface";
+
+/// An open `.vdb` file.
+pub struct Volume {
+    file: VdbFile,
+}
+
+/// A level set of a file, as it was read.
+pub struct VolumeGrid {
+    /// The level set; its band may have to be made regular first.
+    pub level_set: LevelSet,
+    /// Its place in the file.
+    pub index: usize,
+    /// How it is selected.
+    pub selector: String,
+    /// What its band needs.
+    pub band: BandState,
+}
+
+/// What a band needs to be a regular one.
+pub enum BandState {
+    /// Nothing.
+    Regular,
+    /// To be cut to this half width.
+    Trim { half_width: f32, what: String },
+    /// To be made anew; `gross` if the values may be no distances at all.
+    Rebuild { what: String, gross: bool },
+}
+
+/// Whether grids of this class may be taken for level sets, and which one is meant.
+#[derive(Clone, Copy)]
+pub struct Choice<'a> {
+    pub grid: Option<&'a str>,
+    pub assume_level_set: bool,
+}
+
+/// Opens a file; `-` is standard input.
+pub fn open(path: &Path, run: &RunOptions) -> Result<Volume> {
+    Ok(Volume { file: crate::vdb::open(path, run)? })
+}
+
+/// Finds out without loading voxels whether the chosen level set is there; returns how it is selected.
+pub fn probe(path: &Path, choice: Choice) -> Result<String> {
+    let listing = crate::vdb::list(path)?;
+    let index = listing.select_level_set(choice.grid, choice.assume_level_set);
+    let index = index.map_err(|problem| EditError::input(path, problem))?;
+    Ok(listing.grids[index].selector.clone())
+}
+
+/// Limits the threads of OpenVDB.
+pub fn set_threads(threads: usize) -> Result<()> {
+    crate::vdb::set_threads(threads)
+}
+
+impl Volume {
+    /// Reads the chosen level set.
+    pub fn read(&self, choice: Choice) -> Result<VolumeGrid> {
+        let read = self.file.read_level_set(choice.grid, choice.assume_level_set)?;
+        let selector = self.file.listing().grids[read.index].selector.clone();
+        let band = band_state(&read);
+        Ok(VolumeGrid { level_set: read.level_set, index: read.index, selector, band })
+    }
+
+    /// What OpenVDB had to say while reading.
+    pub fn warnings(&self) -> &[String] {
+        &self.file.listing().warnings
+    }
+}
+
+fn band_state(read: &ReadLevelSet) -> BandState {
+    let voxel_size = read.level_set.voxel_size();
+    match &read.band {
+        Band::Regular => BandState::Regular,
+        Band::Trim { inner, outer } => {
+            let half_width = (inner.min(*outer) / voxel_size) as f32;
+            let what = format!(
+                "the band reaches {:.2} voxels inside and {:.2} outside: trimmed to {half_width:.2}",
+                inner / voxel_size,
+                outer / voxel_size
+            );
+            match half_width <= read.level_set.half_width() {
+                true => BandState::Trim { half_width, what },
+                false => BandState::Rebuild { what: read.band.to_string(), gross: false },
+            }
+        }
+        Band::Rebuild { reason } => {
+            BandState::Rebuild { what: reason.clone(), gross: read.facts.non_finite > 0 || read.facts.active_tiles > 0 }
+        }
+    }
+}
+
+/// Writes a level set, in the place of the one that it was made from and with all else that was beside it. Returns the
+/// size of the file and what is not as asked.
+pub fn write(
+    path: &Path,
+    level_set: &LevelSet,
+    from: Option<(&Volume, usize)>,
+    options: &VolumeOptions,
+) -> Result<(u64, Vec<String>)> {
+    let options = WriteOptions {
+        precision: options.half.map(|half| if half { Precision::Half } else { Precision::Float }),
+        compression: options.compression.as_deref().map(|word| match word {
+            "zip" => Compression::Zip,
+            "none" => Compression::None,
+            _ => Compression::Blosc,
+        }),
+        only_result: options.only_result,
+    };
+    let (file, index) = from.unzip();
+    let grid = GridToWrite { level_set, name: from.is_none().then_some(NEW_NAME), replaces: index };
+    let report = crate::vdb::write(path, &[grid], file.map(|volume| &volume.file), &options)?;
+    Ok((report.bytes, report.warnings))
+}
+
+/// What a file says of itself, and its level sets.
+pub struct Description {
+    /// As JSON.
+    pub metadata: Map<String, Value>,
+    /// Format and library.
+    pub format: String,
+    /// Its grids.
+    pub grids: Vec<GridDescription>,
+}
+
+/// A grid of a file.
+pub struct GridDescription {
+    pub name: String,
+    pub selector: String,
+    pub value_type: String,
+    pub class: String,
+    pub voxel_size: DVec3,
+    pub active_voxels: Option<u64>,
+    pub bounds: Option<(DVec3, DVec3)>,
+    pub storage: String,
+    pub metadata: Map<String, Value>,
+    /// Its level set, the reason why it cannot be read as one, or `None` if it does not claim to be one.
+    pub level_set: Option<std::result::Result<VolumeGrid, String>>,
+}
+
+/// Describes a file, or one grid of it.
+pub fn describe(path: &Path, choice: Choice, run: &RunOptions) -> Result<Description> {
+    let volume = open(path, run)?;
+    let listing = volume.file.listing();
+    let chosen = match choice.grid {
+        Some(selector) => Some(listing.find(selector).map_err(|problem| EditError::input(path, problem))?),
+        None => None,
+    };
+    let grids = listing.grids.iter().enumerate().filter(|(index, _)| chosen.is_none_or(|c| c == *index));
+    Ok(Description {
+        metadata: metadata(&listing.metadata),
+        format: format!(
+            "{} (OpenVDB {}.{})",
+            listing.file_version, listing.library_version.0, listing.library_version.1
+        ),
+        grids: grids.map(|(_, grid)| describe_grid(&volume, grid, choice.assume_level_set)).collect(),
+    })
+}
+
+fn describe_grid(volume: &Volume, grid: &GridListing, assume_level_set: bool) -> GridDescription {
+    let wanted = grid.is_scalar() && (grid.is_level_set() || (assume_level_set && grid.class == "unknown"));
+    let read = || {
+        let choice = Choice { grid: Some(&grid.selector), assume_level_set };
+        volume.read(choice).map_err(|e| e.to_string())
+    };
+    let box_in_world = || {
+        let (lo, hi) = grid.active_bounds()?;
+        let to_world = grid.to_world?;
+        let corners = (0..8).map(|c| {
+            let pick = |bit: i32, axis: usize| f64::from(if c & bit == 0 { lo[axis] } else { hi[axis] });
+            to_world.transform_point3(DVec3::new(pick(1, 0), pick(2, 1), pick(4, 2)))
+        });
+        corners.map(|p| (p, p)).reduce(|(lo, hi), (p, _)| (lo.min(p), hi.max(p)))
+    };
+    let precision = if grid.precision == Precision::Half { "half" } else { "full" };
+    let compression = match grid.compression {
+        Compression::Blosc => "blosc",
+        Compression::Zip => "zip",
+        Compression::None => "uncompressed",
+    };
+    GridDescription {
+        name: grid.name.clone(),
+        selector: grid.selector.clone(),
+        value_type: grid.value_type.clone(),
+        class: grid.class.clone(),
+        voxel_size: grid.voxel_size,
+        active_voxels: grid.active_voxels(),
+        bounds: box_in_world(),
+        storage: format!("{precision} precision, {compression}"),
+        metadata: metadata(&grid.metadata),
+        level_set: wanted.then(read),
+    }
+}
+
+/// Metadata as JSON: numbers and booleans as such, everything else as text.
+fn metadata(items: &[MetaItem]) -> Map<String, Value> {
+    let value = |item: &MetaItem| match item.type_name.as_str() {
+        "int32" | "int64" => item.value.parse::<i64>().map(Value::from).ok(),
+        "float" | "double" => item.value.parse::<f64>().map(|v| json!(v)).ok(),
+        "bool" => Some(Value::from(matches!(item.value.as_str(), "true" | "1"))),
+        _ => None,
+    };
+    items.iter().map(|item| (item.name.clone(), value(item).unwrap_or_else(|| item.value.clone().into()))).collect()
+}

@@ -1,0 +1,291 @@
+//! The cells that the surface φ = iso crosses, and the numbering of its vertices.
+//!
+//! A voxel is inside where φ < iso; a value of exactly iso (or NaN) is outside. A cell is the cube between eight
+//! voxels and belongs to the leaf of its first corner, and a vertex lies on each grid edge between an inside and an
+//! outside voxel and belongs to the leaf of the edge's first voxel. The vertices of a leaf are numbered by bit masks
+//! and ranks, so that a cell finds the vertices of its neighbours without a hash. The polygons of a cell are those of
+//! [`cell_case`](super::marching::cell_case): inside is connected through faces (6 neighbours), outside through faces
+//! and edges (18).
+
+use glam::{DVec3, IVec3};
+
+use super::marching::{EDGES, cell_case};
+use crate::error::{EditError, Result};
+use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, LeafValues, Neighbours, neighbour_index, offset_to_local};
+use crate::run::RunOptions;
+
+/// Vertices keep this distance, in voxels, from the ends of their grid edge, so that no two coincide and no triangle
+/// is degenerate where φ = iso at a voxel. Far below the accuracy of linear interpolation; still resolved by f32
+/// files up to 4096 voxels from the origin.
+pub(crate) const VERTEX_MARGIN: f64 = 1.0 / 4096.0;
+
+/// Where φ = iso between two voxels with values `a` and `b` on different sides, 0..1.
+#[inline(always)]
+pub(crate) fn crossing(a: f32, b: f32, iso: f32) -> f64 {
+    let (a, b, iso) = (f64::from(a), f64::from(b), f64::from(iso));
+    let t = (iso - a) / (b - a);
+    // Values that are not finite have no crossing to be found.
+    if t.is_nan() { 0.5 } else { t.clamp(VERTEX_MARGIN, 1.0 - VERTEX_MARGIN) }
+}
+
+/// The signs of a leaf's voxels and of those next to its upper sides: bit z (0..=8) of row (x, y) (0..=8) is set
+/// inside.
+pub(crate) struct SignRows([[u16; 9]; 9]);
+
+impl SignRows {
+    fn gather(signs: &[LeafMask], around: &Neighbours) -> Self {
+        let upper = |x: usize, y: usize, z: usize| {
+            &signs[around[neighbour_index(IVec3::new(x as i32, y as i32, z as i32))].index()]
+        };
+        Self(std::array::from_fn(|x| {
+            std::array::from_fn(|y| {
+                let row = |z| u16::from(upper(x / 8, y / 8, z).row(x % 8, y % 8));
+                row(0) | (row(1) & 1) << 8
+            })
+        }))
+    }
+
+    /// Calls `f` with the first corner and the sign pattern of each cell that the surface crosses.
+    #[inline(always)]
+    pub fn for_each_cell(&self, mut f: impl FnMut(IVec3, u8)) {
+        for x in 0..8 {
+            for y in 0..8 {
+                let rows = [self.0[x][y], self.0[x][y + 1], self.0[x + 1][y], self.0[x + 1][y + 1]];
+                let any = rows.iter().fold(0, |a, r| a | r);
+                let all = rows.iter().fold(u16::MAX, |a, r| a & r);
+                let mut rest = (any | any >> 1) & !(all & all >> 1) & 0xff;
+                while rest != 0 {
+                    let z = rest.trailing_zeros();
+                    rest &= rest - 1;
+                    let pattern = rows.iter().rev().fold(0, |p, r| p << 2 | (r >> z & 3) as u8);
+                    f(IVec3::new(x as i32, y as i32, z as i32), pattern);
+                }
+            }
+        }
+    }
+
+    /// The crossed grid edges along each axis, by their first voxel.
+    fn edges(&self) -> [LeafMask; 3] {
+        let mut edges = [LeafMask::EMPTY; 3];
+        for x in 0..8 {
+            for y in 0..8 {
+                let row = self.0[x][y];
+                let along = [row ^ self.0[x + 1][y], row ^ self.0[x][y + 1], row ^ row >> 1];
+                for (mask, crossed) in edges.iter_mut().zip(along) {
+                    mask.0[x] |= u64::from(crossed & 0xff) << (y * 8);
+                }
+            }
+        }
+        edges
+    }
+}
+
+/// A leaf with crossed cells or crossed edges.
+pub(crate) struct SurfaceLeaf {
+    /// The leaf.
+    pub id: LeafId,
+    /// Number of its first vertex.
+    pub first_vertex: u32,
+    /// Number of its vertices.
+    pub vertices: u32,
+    /// Number of its triangles.
+    pub triangles: u32,
+    /// Number of pieces of surface, one or more a crossed cell.
+    pub loops: u32,
+    /// The crossed edges along each axis, by their first voxel.
+    edges: [LeafMask; 3],
+    /// Vertices of this leaf before each word of `edges`.
+    ranks: [u16; 24],
+}
+
+impl SurfaceLeaf {
+    fn new(id: LeafId, rows: &SignRows) -> Option<Self> {
+        let edges = rows.edges();
+        let mut ranks = [0; 24];
+        let mut vertices = 0;
+        for (rank, word) in ranks.iter_mut().zip(edges.iter().flat_map(|mask| mask.0)) {
+            *rank = vertices;
+            vertices += word.count_ones() as u16;
+        }
+        let (mut triangles, mut loops) = (0, 0);
+        rows.for_each_cell(|_, pattern| {
+            let case = cell_case(pattern);
+            triangles += case.triangles.len() as u32;
+            loops += case.loops;
+        });
+        let vertices = u32::from(vertices);
+        (vertices + loops > 0).then_some(Self { id, first_vertex: 0, vertices, triangles, loops, edges, ranks })
+    }
+
+    /// The number of the vertex on the edge along `axis` whose first voxel is at `offset`; `None` if it is not crossed.
+    #[inline(always)]
+    fn vertex(&self, axis: usize, offset: usize) -> Option<u32> {
+        let (word, bit) = (offset >> 6, offset & 63);
+        let mask = self.edges[axis].0[word];
+        let before = (mask & ((1 << bit) - 1)).count_ones();
+        (mask >> bit & 1 == 1).then(|| self.first_vertex + u32::from(self.ranks[axis * 8 + word]) + before)
+    }
+
+    /// Calls `f` with axis and offset of the first voxel of each crossed edge, in the order of the vertices' numbers.
+    pub fn for_each_vertex(&self, mut f: impl FnMut(usize, usize)) {
+        for (axis, mask) in self.edges.iter().enumerate() {
+            mask.iter().for_each(|offset| f(axis, offset));
+        }
+    }
+}
+
+/// The surface φ = iso of a grid: its leaves in the order of their origins, with numbered vertices.
+pub(crate) struct IsoSurface<'a> {
+    grid: &'a Grid,
+    iso: f32,
+    /// Inside voxels by slot, sentinels included.
+    signs: Vec<LeafMask>,
+    leaves: Vec<SurfaceLeaf>,
+    /// Place in `leaves` by slot; `NO_SURFACE` where there is none.
+    places: Vec<u32>,
+}
+
+/// What to do where the memory for a surface is not there.
+pub(crate) const MEMORY_ADVICE: &str = "resample to a larger voxel size or raise the memory limit";
+
+const NO_SURFACE: u32 = u32::MAX;
+
+impl<'a> IsoSurface<'a> {
+    /// Finds the crossed cells and edges of all leaves; `operation` names the caller in errors.
+    pub fn new(grid: &'a Grid, iso: f32, operation: &str, run: &RunOptions) -> Result<Self> {
+        let per_leaf = 2 * size_of::<LeafMask>() + size_of::<SurfaceLeaf>() + size_of::<Neighbours>() + 4;
+        run.reserve(operation, (grid.leaves().len() * per_leaf) as u64, MEMORY_ADVICE)?;
+        let around = grid.neighbours();
+        let mut signs = vec![LeafMask::EMPTY; around.len()];
+        if let Some(inside) = signs.get_mut(LeafId::INSIDE.index()) {
+            *inside = LeafMask::FULL;
+        }
+        for (&id, mask) in grid.leaves().iter().zip(grid.map_leaves(|id| inside_mask(grid.values(id), iso))) {
+            signs[id.index()] = mask;
+        }
+        let mut leaves: Vec<SurfaceLeaf> = grid
+            .map_leaves(|id| SurfaceLeaf::new(id, &SignRows::gather(&signs, &around[id.index()])))
+            .into_iter()
+            .flatten()
+            .collect();
+        let mut places = vec![NO_SURFACE; around.len()];
+        let mut vertices = 0u32;
+        for (place, leaf) in leaves.iter_mut().enumerate() {
+            places[leaf.id.index()] = place as u32;
+            leaf.first_vertex = vertices;
+            vertices = vertices.checked_add(leaf.vertices).ok_or_else(|| {
+                EditError::parameter(
+                    operation,
+                    "voxel_size",
+                    "the level set's",
+                    "at most 4294967295 surface vertices; resample to a larger one",
+                )
+            })?;
+        }
+        run.check(operation)?;
+        Ok(Self { grid, iso, signs, leaves, places })
+    }
+
+    /// The leaves that the surface crosses, in the order of their origins.
+    pub fn leaves(&self) -> &[SurfaceLeaf] {
+        &self.leaves
+    }
+
+    /// Number of vertices.
+    pub fn vertex_count(&self) -> usize {
+        self.leaves.last().map_or(0, |leaf| (leaf.first_vertex + leaf.vertices) as usize)
+    }
+
+    /// The inside voxels of a leaf or sentinel.
+    pub fn inside(&self, id: LeafId) -> &LeafMask {
+        &self.signs[id.index()]
+    }
+
+    /// Signs of a leaf and its upper neighbours' first layers.
+    pub fn rows(&self, leaf: &SurfaceLeaf) -> SignRows {
+        SignRows::gather(&self.signs, &self.grid.neighbours()[leaf.id.index()])
+    }
+
+    /// Finds the vertices of the cells of a leaf.
+    pub fn cell_vertices(&self, leaf: &SurfaceLeaf) -> CellVertices<'_> {
+        let around = &self.grid.neighbours()[leaf.id.index()];
+        CellVertices {
+            upper: std::array::from_fn(|c| {
+                let id = around[neighbour_index(corner(c))];
+                self.leaves.get(self.places[id.index()] as usize)
+            }),
+        }
+    }
+
+    /// Calls `f` with the index-space position of each vertex of a leaf, in the order of their numbers.
+    pub fn for_each_position(&self, leaf: &SurfaceLeaf, mut f: impl FnMut(DVec3)) {
+        let around = &self.grid.neighbours()[leaf.id.index()];
+        let origin = self.grid.origin(leaf.id);
+        let values = &self.grid.values(leaf.id).0;
+        leaf.for_each_vertex(|axis, offset| {
+            let voxel = offset_to_local(offset);
+            let step = 64 >> (3 * axis);
+            let next = if voxel[axis] + 1 < LEAF_DIM {
+                values[offset + step]
+            } else {
+                let beyond = around[neighbour_index(IVec3::AXES[axis])];
+                self.grid.values(beyond).0[offset - 7 * step]
+            };
+            let mut position = (origin + voxel).as_dvec3();
+            position[axis] += crossing(values[offset], next, self.iso);
+            f(position);
+        });
+    }
+
+    /// A voxel of this leaf whose sign differs from that of the absent leaf next to it: the surface leaves the stored
+    /// leaves there and cannot be followed. `None` everywhere on a valid level set.
+    pub fn leak(&self, id: LeafId) -> Option<IVec3> {
+        let around = &self.grid.neighbours()[id.index()];
+        let inside = self.signs[id.index()];
+        Face::ALL.into_iter().find_map(|face| {
+            let beyond = around[neighbour_index(face.step())];
+            if !beyond.is_sentinel() {
+                return None;
+            }
+            let differing = if beyond == LeafId::INSIDE { LeafMask(inside.0.map(|w| !w)) } else { inside };
+            let offset = differing.spill(face).iter().next()?;
+            // `spill` names the voxel beyond the face, by its place in the neighbour; its counterpart is one step back.
+            Some(self.grid.origin(id) + offset_to_local(offset) + face.step() * (LEAF_DIM - 1))
+        })
+    }
+}
+
+/// The leaves that hold the vertices of a leaf's cells.
+pub(crate) struct CellVertices<'a> {
+    /// The leaf and its seven upper neighbours by corner, where the surface crosses them.
+    upper: [Option<&'a SurfaceLeaf>; 8],
+}
+
+impl CellVertices<'_> {
+    /// Number of the vertex on an edge of the cell with first corner `cell`; `None` if the edge belongs to an absent
+    /// leaf.
+    #[inline(always)]
+    pub fn vertex(&self, cell: IVec3, edge: u8) -> Option<u32> {
+        let (axis, first) = EDGES[usize::from(edge)];
+        let voxel = cell + corner(usize::from(first));
+        let beyond: IVec3 = voxel >> 3;
+        let local: IVec3 = voxel & 7;
+        let leaf = self.upper[(beyond.x * 4 + beyond.y * 2 + beyond.z) as usize]?;
+        leaf.vertex(axis, (local.x * 64 + local.y * 8 + local.z) as usize)
+    }
+}
+
+/// Position of a corner within its cell.
+pub(crate) fn corner(c: usize) -> IVec3 {
+    IVec3::new((c >> 2) as i32, (c >> 1 & 1) as i32, (c & 1) as i32)
+}
+
+fn inside_mask(values: &LeafValues, iso: f32) -> LeafMask {
+    LeafMask(std::array::from_fn(|x| {
+        let mut word = 0;
+        for (bit, value) in values.0[x * 64..(x + 1) * 64].iter().enumerate() {
+            word |= u64::from(*value < iso) << bit;
+        }
+        word
+    }))
+}

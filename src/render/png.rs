@@ -1,0 +1,74 @@
+//! Pictures in memory and as PNG.
+
+use std::io::{self, Write};
+
+/// A picture of 8-bit sRGB with straight alpha.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Image {
+    /// Pixels in a row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Red, green, blue, alpha of each pixel, row by row from the top left.
+    pub rgba8: Vec<u8>,
+}
+
+impl Image {
+    /// The pixel at column `x` and row `y`; `None` outside the picture.
+    pub fn pixel(&self, x: u32, y: u32) -> Option<[u8; 4]> {
+        if x >= self.width {
+            return None;
+        }
+        let at = (y as usize * self.width as usize + x as usize) * 4;
+        self.rgba8.get(at..)?.first_chunk().copied()
+    }
+
+    /// Writes the picture as PNG, marked as sRGB; without an alpha channel where every pixel is opaque.
+    pub fn write_png(&self, to: impl Write) -> io::Result<()> {
+        let opaque = self.rgba8.chunks_exact(4).all(|p| p[3] == u8::MAX);
+        let mut encoder = png::Encoder::new(to, self.width, self.height);
+        encoder.set_depth(png::BitDepth::Eight);
+        encoder.set_color(if opaque { png::ColorType::Rgb } else { png::ColorType::Rgba });
+        encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
+        let mut writer = encoder.write_header()?;
+        if opaque {
+            let rgb: Vec<u8> = self.rgba8.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();
+            writer.write_image_data(&rgb)?;
+        } else {
+            writer.write_image_data(&self.rgba8)?;
+        }
+        writer.finish()?;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn round_trip(image: &Image) -> (png::ColorType, bool, Vec<u8>) {
+        let mut file = Vec::new();
+        image.write_png(&mut file).unwrap();
+        let mut reader = png::Decoder::new(io::Cursor::new(file)).read_info().unwrap();
+        let mut data = vec![0; reader.output_buffer_size().unwrap()];
+        let frame = reader.next_frame(&mut data).unwrap();
+        data.truncate(frame.buffer_size());
+        assert_eq!((frame.width, frame.height), (image.width, image.height));
+        (frame.color_type, reader.info().srgb.is_some(), data)
+    }
+
+    #[test]
+    fn files_hold_the_pixels_and_alpha_only_where_needed() {
+        let mut image = Image { width: 3, height: 1, rgba8: vec![1, 2, 3, 255, 4, 5, 6, 255, 7, 8, 9, 255] };
+        assert_eq!(round_trip(&image), (png::ColorType::Rgb, true, vec![1, 2, 3, 4, 5, 6, 7, 8, 9]));
+        image.rgba8[7] = 0;
+        assert_eq!(round_trip(&image), (png::ColorType::Rgba, true, image.rgba8.clone()));
+        assert_eq!((image.pixel(1, 0), image.pixel(3, 0), image.pixel(0, 1)), (Some([4, 5, 6, 0]), None, None));
+    }
+
+    #[test]
+    fn a_full_disk_is_an_error() {
+        let image = Image { width: 64, height: 64, rgba8: vec![200; 64 * 64 * 4] };
+        assert!(image.write_png(&mut [0u8; 40][..]).is_err());
+    }
+}

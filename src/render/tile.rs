@@ -1,0 +1,276 @@
+//! A tile of the picture: hits, visibility, filter, colours, and more samples where the picture has an edge.
+//!
+//! Every pixel is computed from its own coordinates, and a tile looks at a rim of pixels around it, so the picture does not
+//! depend on how it is cut into tiles or which thread takes which.
+
+use glam::{DVec2, DVec3, DVec4};
+
+use super::camera::Camera;
+use super::field::Cursor;
+use super::march::{Ray, Scene, Start};
+use super::occlusion::{self, FilterPoint, Light, REACH, Visibility, filter_weight};
+use super::shade::{self, Lights};
+use super::{ColorBy, DataRange};
+use crate::grid::Transform;
+use crate::levelset::Sampler;
+
+/// Edge of a tile in pixels. The rim costs an eighth more work.
+pub(super) const TILE: u32 = 96;
+/// Pixels around a tile that are computed too: one for the search for edges, the filter's reach around that.
+const RIM: i64 = REACH as i64 + 1;
+/// A step of colour between neighbours that counts as an edge, linear.
+const COLOR_EDGE: f64 = 0.06;
+/// Cosine between the normals of neighbours below which there is an edge.
+const NORMAL_EDGE: f64 = 0.96;
+
+/// All that the tiles share.
+pub(super) struct Picture<'a> {
+    pub scene: Option<Scene<'a>>,
+    pub camera: Camera,
+    pub transform: Transform,
+    pub lights: Lights,
+    pub light: Light,
+    pub color_by: &'a ColorBy<'a>,
+    pub range: DataRange,
+    /// Samples along the side of a pixel at edges.
+    pub antialias: u32,
+    pub width: u32,
+    pub height: u32,
+    /// Linear colour at the top and bottom; none is transparent.
+    pub background: Option<[DVec3; 2]>,
+}
+
+/// A surface point that a ray met.
+#[derive(Clone, Copy)]
+struct Hit {
+    /// Index space, with the normal along index axes.
+    point: FilterPoint,
+    /// Edge of a pixel there, in voxels.
+    footprint: f64,
+    /// World space.
+    normal: DVec3,
+    view: DVec3,
+    albedo: DVec3,
+}
+
+/// Readers of one tile.
+struct Readers<'a> {
+    cursor: Cursor<'a>,
+    other: Option<(Sampler<'a>, &'a Transform, f64)>,
+}
+
+/// Pixels of a tile with its rim.
+struct Window {
+    x: i64,
+    y: i64,
+    columns: usize,
+    rows: usize,
+}
+
+impl Window {
+    fn index(&self, x: i64, y: i64) -> usize {
+        (y - self.y) as usize * self.columns + (x - self.x) as usize
+    }
+
+    /// The pixels within `reach` of the tile, with their indices.
+    fn pixels(&self, reach: i64) -> impl Iterator<Item = (i64, i64, usize)> + '_ {
+        let skip = RIM - reach;
+        let (x0, y0) = (self.x + skip, self.y + skip);
+        let (x1, y1) = (self.x + self.columns as i64 - skip, self.y + self.rows as i64 - skip);
+        (y0..y1).flat_map(move |y| (x0..x1).map(move |x| (x, y, self.index(x, y))))
+    }
+}
+
+impl Picture<'_> {
+    /// RGBA of the tile whose first pixel is (x0, y0), row by row, cut at the picture's border.
+    pub fn tile(&self, x0: u32, y0: u32) -> Vec<u8> {
+        let (width, height) = (TILE.min(self.width - x0), TILE.min(self.height - y0));
+        let Some(scene) = &self.scene else {
+            return (y0..y0 + height)
+                .flat_map(|y| (x0..x0 + width).flat_map(move |x| self.encode(x, y, DVec4::ZERO)))
+                .collect();
+        };
+        let window = Window {
+            x: i64::from(x0) - RIM,
+            y: i64::from(y0) - RIM,
+            columns: width as usize + 2 * RIM as usize,
+            rows: height as usize + 2 * RIM as usize,
+        };
+        let mut readers = Readers {
+            cursor: scene.field.cursor(),
+            other: match self.color_by {
+                ColorBy::Difference(other) => Some((other.sampler(), other.transform(), other.voxel_size())),
+                _ => None,
+            },
+        };
+        let centre = DVec2::splat(0.5);
+        let hits: Vec<Option<Hit>> =
+            window.pixels(RIM).map(|(x, y, _)| self.cast(scene, &mut readers, pixel(x, y) + centre)).collect();
+        let raw: Vec<Visibility> = window
+            .pixels(RIM)
+            .map(|(x, y, i)| {
+                hits[i].map_or(Visibility::default(), |hit| {
+                    let at = (hit.point.position, hit.point.normal);
+                    occlusion::visibility(scene, &mut readers.cursor, &self.light, at, (x, y))
+                })
+            })
+            .collect();
+        let mut seen = vec![Visibility::default(); hits.len()];
+        for (x, y, i) in window.pixels(1) {
+            if let Some(hit) = &hits[i] {
+                seen[i] = self.mean(&window, &hits, &raw, hit, (x, y), REACH as i64).unwrap_or(raw[i]);
+            }
+        }
+        let mut rgba = Vec::with_capacity((width * height * 4) as usize);
+        for (x, y, i) in window.pixels(0) {
+            let color = if self.antialias > 1 && self.is_edge(&window, &hits, (x, y)) {
+                self.supersample(scene, &mut readers, &window, &hits, &seen, (x, y))
+            } else {
+                hits[i].map_or(DVec4::ZERO, |hit| self.color(&hit, seen[i]).extend(1.0))
+            };
+            rgba.extend(self.encode(x as u32, y as u32, color));
+        }
+        rgba
+    }
+
+    /// What a ray through a point of the picture meets.
+    fn cast(&self, scene: &Scene<'_>, readers: &mut Readers<'_>, at: DVec2) -> Option<Hit> {
+        let direction = self.camera.direction(at.x, at.y);
+        let to_index = self.transform.to_index();
+        // Unit in index space: voxels are cubes, so lengths are only scaled.
+        let ray = Ray::new(
+            to_index.transform_point3(self.camera.eye),
+            to_index.transform_vector3(direction) * self.transform.voxel_size(),
+        );
+        let t = scene.hit(&mut readers.cursor, &ray, Start::Outside, f64::INFINITY)?;
+        let position = ray.at(t);
+        let jet = readers.cursor.jet(position);
+        let normal = jet.gradient.normalize_or(-ray.direction);
+        let world_normal = self.transform.direction_to_world(normal);
+        let xyz = || self.transform.index_to_world(position);
+        let albedo = match self.color_by {
+            ColorBy::Clay => shade::CLAY * shade::patina(jet.mean_curvature()),
+            ColorBy::Normal => shade::to_linear(world_normal * 0.5 + 0.5),
+            ColorBy::Curvature => shade::diverging(jet.mean_curvature() / self.range.0),
+            ColorBy::Difference(_) => readers.other.as_mut().map_or(shade::CLAY, |(sampler, transform, voxel)| {
+                let phi = f64::from(sampler.trilinear(transform.world_to_index(xyz())));
+                shade::diverging(phi / *voxel / self.range.0)
+            }),
+            ColorBy::Region(region) => REGION_OFF.lerp(REGION_ON, f64::from(region.weight(xyz())).clamp(0.0, 1.0)),
+            ColorBy::Label(label) => label(xyz()).map_or(shade::CLAY, shade::label),
+        };
+        Some(Hit {
+            point: FilterPoint { position, normal },
+            footprint: t * self.camera.pixel(),
+            normal: world_normal,
+            view: -direction,
+            albedo,
+        })
+    }
+
+    /// Mean visibility around a pixel over the surface that `hit` is on; `None` if no pixel shows it.
+    fn mean(
+        &self,
+        window: &Window,
+        hits: &[Option<Hit>],
+        values: &[Visibility],
+        hit: &Hit,
+        (x, y): (i64, i64),
+        reach: i64,
+    ) -> Option<Visibility> {
+        let (mut sum, mut sky, mut key) = (0.0, 0.0, 0.0);
+        for dy in -reach..=reach {
+            for dx in -reach..=reach {
+                let at = window.index(x + dx, y + dy);
+                if let Some(other) = &hits[at] {
+                    let distance = hit.footprint * (dx.abs().max(dy.abs()) + 1) as f64;
+                    let weight = filter_weight(dx) * filter_weight(dy) * hit.point.affinity(&other.point, distance);
+                    sum += weight;
+                    sky += weight * values[at].sky;
+                    key += weight * values[at].key;
+                }
+            }
+        }
+        (sum > 0.05).then(|| Visibility { sky: sky / sum, key: key / sum })
+    }
+
+    /// Whether a pixel and its neighbours show different surfaces, orientations or colours.
+    fn is_edge(&self, window: &Window, hits: &[Option<Hit>], (x, y): (i64, i64)) -> bool {
+        let centre = &hits[window.index(x, y)];
+        (-1..=1).any(|dy| {
+            (-1..=1).any(|dx| match (centre, &hits[window.index(x + dx, y + dy)]) {
+                (None, None) => false,
+                (Some(a), Some(b)) => {
+                    a.normal.dot(b.normal) < NORMAL_EDGE
+                        || (a.albedo - b.albedo).abs().max_element() > COLOR_EDGE
+                        || (b.point.position - a.point.position).dot(a.point.normal).abs() > 1.5 * a.footprint
+                }
+                _ => true,
+            })
+        })
+    }
+
+    /// The mean of a grid of samples over a pixel, premultiplied.
+    fn supersample(
+        &self,
+        scene: &Scene<'_>,
+        readers: &mut Readers<'_>,
+        window: &Window,
+        hits: &[Option<Hit>],
+        seen: &[Visibility],
+        (x, y): (i64, i64),
+    ) -> DVec4 {
+        let n = self.antialias;
+        let mut sum = DVec4::ZERO;
+        for k in 0..n * n {
+            // Rows and columns sheared against each other, so that upright and level edges get n² steps, not n.
+            let (i, j) = (f64::from(k % n), f64::from(k / n));
+            let side = f64::from(n);
+            let offset = DVec2::new(i + (j + 0.5) / side, j + (i + 0.5) / side) / side;
+            if let Some(hit) = self.cast(scene, readers, pixel(x, y) + offset) {
+                let visibility = self.mean(window, hits, seen, &hit, (x, y), 1).unwrap_or_else(|| {
+                    // A part too thin for any pixel's centre.
+                    let at = (hit.point.position, hit.point.normal);
+                    occlusion::visibility(scene, &mut readers.cursor, &self.light, at, (x + i64::from(k), y))
+                });
+                sum += self.color(&hit, visibility).extend(1.0);
+            }
+        }
+        sum / f64::from(n * n)
+    }
+
+    /// Displayed colour of a surface point, linear.
+    fn color(&self, hit: &Hit, seen: Visibility) -> DVec3 {
+        match self.color_by {
+            ColorBy::Clay => shade::filmic(shade::clay(&self.lights, hit.albedo, hit.normal, hit.view, seen)),
+            ColorBy::Normal => hit.albedo * (0.4 + 0.6 * seen.sky),
+            _ => shade::data(&self.lights, hit.albedo, hit.normal, hit.view, seen).min(DVec3::ONE),
+        }
+    }
+
+    /// A pixel from its premultiplied linear colour, over the background.
+    fn encode(&self, x: u32, y: u32, color: DVec4) -> [u8; 4] {
+        let alpha = color.w.clamp(0.0, 1.0);
+        let dither = shade::dither(x, y);
+        match self.background {
+            Some([top, bottom]) => {
+                let part = (f64::from(y) + 0.5) / f64::from(self.height);
+                let [r, g, b] = shade::encode(color.truncate() + top.lerp(bottom, part) * (1.0 - alpha), dither);
+                [r, g, b, u8::MAX]
+            }
+            None if alpha == 0.0 => [0; 4],
+            None => {
+                let [r, g, b] = shade::encode(color.truncate() / alpha, dither);
+                [r, g, b, (alpha * 255.0).round() as u8]
+            }
+        }
+    }
+}
+
+/// Colours of a region's weight 0 and 1.
+const REGION_OFF: DVec3 = DVec3::new(0.62, 0.62, 0.62);
+const REGION_ON: DVec3 = DVec3::new(0.95, 0.33, 0.05);
+
+fn pixel(x: i64, y: i64) -> DVec2 {
+    DVec2::new(x as f64, y as f64)
+}

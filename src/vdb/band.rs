@@ -1,0 +1,333 @@
+//! Bands as other programs write them: whether one is regular, only needs trimming, or must be rebuilt.
+//!
+//! A regular band holds |φ| < background in its active voxels and ±background everywhere else. Houdini also makes bands of
+//! unequal inner and outer width, grids whose whole interior is active, and backgrounds that are no width of the band.
+//! Widths here are in world units unless the name says voxels.
+
+use std::fmt;
+
+use super::bridge::ffi;
+use crate::grid::{LeafMask, LeafValues};
+
+/// A band narrower than this on either side cannot carry a gradient: it must be rebuilt, not trimmed.
+const MIN_HALF_WIDTH_VOXELS: f64 = 1.0;
+
+/// Relative difference up to which a width counts as the background: half floats are stored with 2⁻¹¹.
+const WIDTH_TOLERANCE: f64 = 1e-3;
+
+/// Smallest and largest of some values; none if `low > high`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Range {
+    /// The smallest.
+    pub low: f64,
+    /// The largest.
+    pub high: f64,
+}
+
+impl Range {
+    const EMPTY: Self = Self { low: f64::INFINITY, high: f64::NEG_INFINITY };
+
+    /// Whether there was no value.
+    pub fn is_empty(&self) -> bool {
+        self.low > self.high
+    }
+
+    fn add(&mut self, value: f64) {
+        self.low = self.low.min(value);
+        self.high = self.high.max(value);
+    }
+
+    fn join(&mut self, other: &Self) {
+        self.low = self.low.min(other.low);
+        self.high = self.high.max(other.high);
+    }
+}
+
+/// The exponent bits of an f32: all set where it is infinite or no number.
+const EXPONENT: u32 = 0x7f80_0000;
+
+/// The 8 bits of a row's mask, each spread over the 32 bits of its voxel.
+static LANES: [[u32; 8]; 256] = {
+    let mut lanes = [[0; 8]; 256];
+    let mut row = 0;
+    while row < 256 {
+        let mut z = 0;
+        while z < 8 {
+            lanes[row][z] = if row >> z & 1 == 1 { u32::MAX } else { 0 };
+            z += 1;
+        }
+        row += 1;
+    }
+    lanes
+};
+
+/// A range for each of the 8 voxels of a row.
+struct RowRange {
+    low: [f32; 8],
+    high: [f32; 8],
+}
+
+impl RowRange {
+    const EMPTY: Self = Self { low: [f32::INFINITY; 8], high: [f32::NEG_INFINITY; 8] };
+
+    /// Takes the values where all bits of `counts` are set, and ignores those where none is.
+    #[inline(always)]
+    fn add(&mut self, bits: &[u32; 8], counts: &[u32; 8]) {
+        for z in 0..8 {
+            let low = f32::from_bits((bits[z] & counts[z]) | (f32::INFINITY.to_bits() & !counts[z]));
+            // Comparisons with NaN are false: it changes neither end.
+            self.low[z] = if low < self.low[z] { low } else { self.low[z] };
+        }
+        for z in 0..8 {
+            let high = f32::from_bits((bits[z] & counts[z]) | (f32::NEG_INFINITY.to_bits() & !counts[z]));
+            self.high[z] = if high > self.high[z] { high } else { self.high[z] };
+        }
+    }
+
+    fn joined(&self) -> Range {
+        let mut range = Range::EMPTY;
+        self.low.iter().for_each(|v| range.low = range.low.min(f64::from(*v)));
+        self.high.iter().for_each(|v| range.high = range.high.max(f64::from(*v)));
+        range
+    }
+}
+
+/// What was measured of a grid's values as stored, in world units.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BandFacts {
+    /// The stored background.
+    pub background: f64,
+    /// Active voxels.
+    pub active: Range,
+    /// Inactive voxels and tiles of negative value.
+    pub inactive_inside: Range,
+    /// Inactive voxels and tiles of positive value.
+    pub inactive_outside: Range,
+    /// Number of active tiles.
+    pub active_tiles: u64,
+    /// Values of active tiles.
+    pub active_tile_values: Range,
+    /// Voxels that are NaN or infinite.
+    pub non_finite: u64,
+}
+
+impl BandFacts {
+    pub(super) fn new(background: f64) -> Self {
+        Self {
+            background,
+            active: Range::EMPTY,
+            inactive_inside: Range::EMPTY,
+            inactive_outside: Range::EMPTY,
+            active_tiles: 0,
+            active_tile_values: Range::EMPTY,
+            non_finite: 0,
+        }
+    }
+
+    pub(super) fn take_tiles(&mut self, leaves: &ffi::Leaves) -> Result<(), cxx::Exception> {
+        let (mut low, mut high) = (0.0, 0.0);
+        leaves.inactive_tile_range(&mut low, &mut high)?;
+        for value in [low, high].into_iter().filter(|v| v.is_finite()) {
+            self.add_inactive(value);
+        }
+        for tile in leaves.tiles()?.iter().filter(|tile| tile.active) {
+            self.active_tiles += 1;
+            self.active_tile_values.add(f64::from(tile.value));
+        }
+        Ok(())
+    }
+
+    /// Rows of 8 voxels side by side and without branches, so that the compiler uses vector instructions: branches make this
+    /// pass take longer than reading the leaf.
+    pub(super) fn of_leaf(values: &LeafValues, mask: LeafMask) -> Self {
+        let mut active = RowRange::EMPTY;
+        let mut inside = RowRange::EMPTY;
+        let mut outside = RowRange::EMPTY;
+        let mut non_finite = [0u32; 8];
+        let (rows, _) = values.0.as_chunks::<8>();
+        for (row, values) in rows.iter().enumerate() {
+            let on = LANES[usize::from(mask.row(row / 8, row % 8))];
+            let bits = values.map(f32::to_bits);
+            let negative = bits.map(|b| ((b as i32) >> 31) as u32);
+            active.add(&bits, &on);
+            inside.add(&bits, &std::array::from_fn(|z| !on[z] & negative[z]));
+            outside.add(&bits, &std::array::from_fn(|z| !on[z] & !negative[z]));
+            for z in 0..8 {
+                non_finite[z] += u32::from(bits[z] & EXPONENT == EXPONENT);
+            }
+        }
+        Self {
+            active: active.joined(),
+            inactive_inside: inside.joined(),
+            inactive_outside: outside.joined(),
+            non_finite: non_finite.iter().map(|n| u64::from(*n)).sum(),
+            ..Self::new(0.0)
+        }
+    }
+
+    fn add_inactive(&mut self, value: f64) {
+        if value < 0.0 { self.inactive_inside.add(value) } else { self.inactive_outside.add(value) }
+    }
+
+    pub(super) fn join(&mut self, leaf: &Self) {
+        self.active.join(&leaf.active);
+        self.inactive_inside.join(&leaf.inactive_inside);
+        self.inactive_outside.join(&leaf.inactive_outside);
+        self.non_finite += leaf.non_finite;
+    }
+
+    /// The stored background, or one that can stand for "outside" where that is not a positive number.
+    pub(super) fn usable_background(&self, voxel_size: f64) -> f32 {
+        let stored = self.background as f32;
+        let fallback = (voxel_size as f32).max(f32::MIN_POSITIVE);
+        if stored.is_finite() && stored > 0.0 { stored } else { fallback }
+    }
+
+    /// Whether some inactive voxel is not exactly ±background.
+    pub(super) fn has_odd_inactive(&self, background: f32) -> bool {
+        let b = f64::from(background);
+        let odd = |range: &Range, value: f64| !range.is_empty() && (range.low != value || range.high != value);
+        self.non_finite > 0 || odd(&self.inactive_inside, -b) || odd(&self.inactive_outside, b)
+    }
+}
+
+/// What must be done to a band to make it regular.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Band {
+    /// Nothing.
+    Regular,
+    /// Its distances are right but reach farther on one side, or the background is no width of the band: cut both sides to
+    /// the smaller of the two.
+    Trim {
+        /// Width of the band inside.
+        inner: f64,
+        /// Width of the band outside.
+        outer: f64,
+    },
+    /// It cannot be trimmed: distances must be computed again from the zero set.
+    Rebuild {
+        /// Why.
+        reason: String,
+    },
+}
+
+impl fmt::Display for Band {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Regular => write!(f, "the band is regular"),
+            Self::Trim { inner, outer } => write!(
+                f,
+                "the band reaches {inner} inside and {outer} outside; it is trimmed to {} on both sides",
+                inner.min(*outer)
+            ),
+            Self::Rebuild { reason } => write!(f, "the band must be rebuilt from the surface: {reason}"),
+        }
+    }
+}
+
+/// Judges a band by what was measured of it.
+///
+/// The width of a side is that of its inactive voxels if the active ones reach there, else the farthest active value. A side
+/// without inactive voxels (a thin solid, or an interior that is active throughout) does not limit the band.
+pub fn diagnose_band(facts: &BandFacts, voxel_size: f64) -> Band {
+    let rebuild = |reason: String| Band::Rebuild { reason };
+    if facts.non_finite > 0 {
+        return rebuild(format!("{} voxels are not numbers", facts.non_finite));
+    }
+    if !(facts.background.is_finite() && facts.background > 0.0) {
+        return rebuild(format!("its background is {}; a positive distance is wanted", facts.background));
+    }
+    if facts.active.is_empty() && facts.active_tiles == 0 && facts.inactive_inside.is_empty() {
+        return Band::Regular;
+    }
+    let outside_value = if facts.inactive_outside.is_empty() { facts.background } else { facts.inactive_outside.low };
+    let outer = side(facts.active.high, outside_value, voxel_size);
+    let inner = match facts.inactive_inside.is_empty() {
+        true => (-facts.active.low).max(facts.background),
+        false => side(-facts.active.low, -facts.inactive_inside.high, voxel_size),
+    };
+    let width = inner.min(outer);
+    if facts.active_tiles > 0 {
+        let Range { low, high } = facts.active_tile_values;
+        if low.abs().min(high.abs()) < width || low * high < 0.0 {
+            return rebuild(format!(
+                "{} active tiles with values {low} to {high} hold no distances",
+                facts.active_tiles
+            ));
+        }
+    }
+    if width < MIN_HALF_WIDTH_VOXELS * voxel_size {
+        return rebuild(format!(
+            "it is {:.2} voxels wide inside and {:.2} outside; at least {MIN_HALF_WIDTH_VOXELS} is needed",
+            inner / voxel_size,
+            outer / voxel_size
+        ));
+    }
+    let close = |a: f64, b: f64| (a - b).abs() <= WIDTH_TOLERANCE * b.abs();
+    let b = facts.background;
+    let within = facts.active.is_empty() || (facts.active.low > -b && facts.active.high < b);
+    if close(inner, b) && close(outer, b) && facts.active_tiles == 0 && within {
+        Band::Regular
+    } else {
+        Band::Trim { inner, outer }
+    }
+}
+
+/// Width of one side from the farthest active distance and the distance that its inactive voxels hold: the latter, if the
+/// active ones come within a voxel of it.
+fn side(active: f64, inactive: f64, voxel_size: f64) -> f64 {
+    if active.is_finite() && active < inactive - voxel_size * (1.0 + WIDTH_TOLERANCE) {
+        active.max(0.0)
+    } else {
+        inactive
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn facts(background: f64, active: (f64, f64), inside: Option<f64>) -> BandFacts {
+        BandFacts {
+            active: Range { low: active.0, high: active.1 },
+            inactive_inside: inside.map_or(Range::EMPTY, |v| Range { low: v, high: v }),
+            inactive_outside: Range { low: background, high: background },
+            ..BandFacts::new(background)
+        }
+    }
+
+    #[test]
+    fn regular_bands_thick_and_thin() {
+        assert_eq!(diagnose_band(&facts(0.3, (-0.29, 0.28), Some(-0.3)), 0.1), Band::Regular);
+        // A plate thinner than the band has no inactive voxel inside.
+        assert_eq!(diagnose_band(&facts(0.3, (-0.12, 0.29), None), 0.1), Band::Regular);
+        assert_eq!(diagnose_band(&BandFacts::new(0.3), 0.1), Band::Regular);
+    }
+
+    #[test]
+    fn unequal_widths_and_filled_interiors_are_trimmed() {
+        assert_eq!(diagnose_band(&facts(0.3, (-0.49, 0.29), Some(-0.5)), 0.1), Band::Trim { inner: 0.5, outer: 0.3 });
+        assert_eq!(diagnose_band(&facts(0.3, (-7.0, 0.29), None), 0.1), Band::Trim { inner: 7.0, outer: 0.3 });
+        // A background far from the band.
+        let odd = diagnose_band(&facts(1e6, (-0.29, 0.28), Some(-0.3)), 0.1);
+        assert_eq!(odd, Band::Trim { inner: 0.3, outer: 0.28 });
+        assert!(odd.to_string().contains("trimmed to 0.28"));
+    }
+
+    #[test]
+    fn what_cannot_be_trimmed_is_rebuilt() {
+        let reason = |f: &BandFacts| match diagnose_band(f, 0.1) {
+            Band::Rebuild { reason } => reason,
+            other => panic!("{other:?}"),
+        };
+        assert!(reason(&facts(0.0, (-0.2, 0.2), None)).contains("background is 0"));
+        assert!(reason(&facts(0.3, (-0.05, 0.29), Some(-0.06))).contains("voxels wide"));
+        let tiles = BandFacts {
+            active_tiles: 5,
+            active_tile_values: Range { low: 0.0, high: 0.0 },
+            ..facts(0.3, (-0.29, 0.29), Some(-0.3))
+        };
+        assert!(reason(&tiles).contains("5 active tiles"));
+        assert!(reason(&BandFacts { non_finite: 2, ..facts(0.3, (-0.29, 0.29), None) }).contains("2 voxels"));
+    }
+}

@@ -1,0 +1,231 @@
+//! Reading: the listing of a file, and its level sets.
+
+use std::io::Read;
+use std::path::Path;
+
+use cxx::UniquePtr;
+use glam::IVec3;
+use rayon::prelude::*;
+
+use super::band::{Band, BandFacts, diagnose_band};
+use super::bridge::ffi;
+use super::listing::FileListing;
+use super::select::select_level_set;
+use super::structure::{START_BYTES, check_start};
+use crate::error::{EditError, Result};
+use crate::grid::{Grid, LEAF_DIM, MAX_COORD};
+use crate::levelset::LevelSet;
+use crate::run::RunOptions;
+
+/// Stands for standard input and output.
+pub(super) const PIPE: &str = "-";
+
+/// What a file holds, without loading voxels. `-` is standard input. A file written as a stream, which has no table of
+/// offsets, must be read whole.
+pub fn list(path: impl AsRef<Path>) -> Result<FileListing> {
+    let path = path.as_ref();
+    let archive = open_archive(path, true)?;
+    FileListing::of(&archive).map_err(|e| EditError::input(path, e.what()))
+}
+
+/// A file that was read whole: the source of level sets, and of everything that an edit carries over.
+pub struct VdbFile {
+    pub(super) archive: UniquePtr<ffi::Archive>,
+    listing: FileListing,
+    path: std::path::PathBuf,
+}
+
+/// A level set as it was read.
+#[derive(Clone)]
+pub struct ReadLevelSet {
+    /// Its values, inactive ones ±background. A valid level set if `band` is [`Band::Regular`].
+    pub level_set: LevelSet,
+    /// Its place in the file.
+    pub index: usize,
+    /// What must be done to the band to make it regular.
+    pub band: Band,
+    /// What was measured of it.
+    pub facts: BandFacts,
+}
+
+/// Reads a whole file. `-` is standard input. Refused before reading if the file itself says that its grids need more than
+/// the memory limit of `run`.
+pub fn open(path: impl AsRef<Path>, run: &RunOptions) -> Result<VdbFile> {
+    let path = path.as_ref();
+    run.check("reading")?;
+    if run.memory_limit.is_some() && path.is_file() {
+        let listing = list(path)?;
+        let needed = listing.grids.iter().filter_map(|g| g.meta("file_mem_bytes")?.parse::<u64>().ok()).sum();
+        run.reserve("reading", needed, "take a file with fewer or smaller grids")?;
+    }
+    let archive = open_archive(path, false)?;
+    let listing = FileListing::of(&archive).map_err(|e| EditError::input(path, e.what()))?;
+    Ok(VdbFile { archive, listing, path: path.into() })
+}
+
+impl VdbFile {
+    /// What the file holds.
+    pub fn listing(&self) -> &FileListing {
+        &self.listing
+    }
+
+    /// The grid that `selector` names and that can be read as a level set: `NAME`, `NAME[n]` for the n-th (from 0) of several
+    /// of one name, the empty text for an unnamed grid; without a selector the only one. Grids whose class was never set count
+    /// if `assume_level_set`.
+    pub fn select_level_set(&self, selector: Option<&str>, assume_level_set: bool) -> Result<usize> {
+        select_level_set(&self.listing.grids, selector, assume_level_set).map_err(|e| self.error(e))
+    }
+
+    /// Reads the level set that [`select_level_set`](Self::select_level_set) chooses. Doubles are rounded to f32.
+    pub fn read_level_set(&self, selector: Option<&str>, assume_level_set: bool) -> Result<ReadLevelSet> {
+        let index = self.select_level_set(selector, assume_level_set)?;
+        let listing = &self.listing.grids[index];
+        let refuse =
+            |reason: String| self.error(format!("grid `{}` cannot be a level set: {reason}", listing.selector));
+        let transform = listing.uniform_transform().map_err(refuse)?;
+        let leaves = ffi::archive_leaves(&self.archive, index).map_err(|e| refuse(e.what().into()))?;
+        let (grid, facts) = read_grid(&leaves, transform.voxel_size()).map_err(refuse)?;
+        let band = diagnose_band(&facts, transform.voxel_size());
+        Ok(ReadLevelSet { level_set: LevelSet::new(grid, transform), index, band, facts })
+    }
+
+    /// 128 bits, as text, that are equal for grids of the same structure and values: for tests and comparisons.
+    pub fn fingerprint(&self, index: usize) -> Result<String> {
+        ffi::grid_fingerprint(&self.archive, index).map_err(|e| self.error(e.what()))
+    }
+
+    fn error(&self, problem: impl Into<String>) -> EditError {
+        EditError::input(&self.path, problem)
+    }
+}
+
+/// Limits the threads that OpenVDB uses from now on; 0 lifts the limit.
+pub fn set_threads(threads: usize) -> Result<()> {
+    ffi::set_threads(threads).map_err(|e| EditError::parameter("OpenVDB", "threads", threads, e.what()))
+}
+
+/// Version of the OpenVDB library in use.
+pub fn library_version() -> String {
+    ffi::library_version().unwrap_or_else(|_| "unknown".into())
+}
+
+fn open_archive(path: &Path, headers_only: bool) -> Result<UniquePtr<ffi::Archive>> {
+    let fail = |problem: String| EditError::input(path, problem);
+    let bytes = if path == Path::new(PIPE) {
+        Some(read_all(std::io::stdin().lock()))
+    } else {
+        let facts = std::fs::metadata(path).map_err(|e| fail(format!("cannot be opened: {e}")))?;
+        if facts.is_dir() {
+            return Err(fail("is a directory; a .vdb file is wanted".into()));
+        }
+        // Pipes and devices cannot seek.
+        (!facts.is_file()).then(|| read_all(std::fs::File::open(path)?))
+    };
+    let newest = ffi::newest_file_version();
+    let archive = match bytes {
+        Some(bytes) => {
+            let bytes = bytes.map_err(|e| fail(format!("cannot be read: {e}")))?;
+            check_start(&bytes[..bytes.len().min(START_BYTES)], newest).map_err(fail)?;
+            ffi::read_bytes(&bytes, headers_only)
+        }
+        None => {
+            let start = read_start(path).map_err(|e| fail(format!("cannot be read: {e}")))?;
+            check_start(&start, newest).map_err(fail)?;
+            ffi::read_path(path.as_os_str().as_encoded_bytes(), headers_only)
+        }
+    };
+    archive.map_err(|e| fail(e.what().into()))
+}
+
+fn read_all(mut from: impl Read) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    from.read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+fn read_start(path: &Path) -> std::io::Result<Vec<u8>> {
+    read_all(std::fs::File::open(path)?.take(START_BYTES as u64))
+}
+
+/// Copies the leaves and signs of a float or double grid. Inactive voxels become ±background by their sign, once what
+/// they held has been noted. Fails with a reason.
+pub(super) fn read_grid(leaves: &ffi::Leaves, voxel_size: f64) -> Result<(Grid, BandFacts), String> {
+    let mut flat = vec![0; leaves.count() * 3];
+    leaves.origins(&mut flat).map_err(|e| e.what().to_string())?;
+    let (triples, _) = flat.as_chunks::<3>();
+    // Ours are in the order of origins; OpenVDB's go node by node.
+    let mut order: Vec<(IVec3, usize)> = triples.iter().map(|o| IVec3::from_array(*o)).zip(0..).collect();
+    order.par_sort_unstable_by_key(|(o, _)| (o.x, o.y, o.z));
+    if let Some((far, _)) = order.iter().find(|(o, _)| o.abs().max_element() > MAX_COORD - LEAF_DIM) {
+        return Err(format!("it reaches to voxel {far}; coordinates go to ±{MAX_COORD}"));
+    }
+    let origins: Vec<IVec3> = order.iter().map(|(o, _)| *o).collect();
+
+    let mut facts = BandFacts::new(leaves.background());
+    facts.take_tiles(leaves).map_err(|e| e.what().to_string())?;
+    let background = facts.usable_background(voxel_size);
+    let mut grid = Grid::from_origins(background, &origins);
+    // A fresh grid has its leaves in slot order.
+    let first = grid.leaves().first().map_or(0, |id| id.index());
+    let failed = std::sync::Mutex::new(None);
+    grid.update_all(|id, values, mask| {
+        if let Err(e) = leaves.copy(order[id.index() - first].1, &mut values.0, &mut mask.0) {
+            failed.lock().unwrap_or_else(|p| p.into_inner()).get_or_insert(e.what().to_string());
+        }
+    });
+    if let Some(problem) = failed.into_inner().unwrap_or_else(|p| p.into_inner()) {
+        return Err(problem);
+    }
+    let of_leaves = grid.map_leaves(|id| BandFacts::of_leaf(grid.values(id), grid.mask(id)));
+    of_leaves.iter().for_each(|leaf| facts.join(leaf));
+    if facts.has_odd_inactive(background) {
+        grid.update_all(|_, values, mask| {
+            for (offset, value) in values.0.iter_mut().enumerate() {
+                if !mask.get(offset) {
+                    *value = background.copysign(*value);
+                }
+            }
+        });
+    }
+    set_signs(&mut grid, leaves)?;
+    Ok((grid, facts))
+}
+
+/// Gives the space between the leaves the signs of the tiles.
+fn set_signs(grid: &mut Grid, leaves: &ffi::Leaves) -> Result<(), String> {
+    const NODE_WORDS: usize = 64;
+    let mut origins = vec![0; leaves.node_count() * 3];
+    let mut inside = vec![0; leaves.node_count() * NODE_WORDS];
+    leaves.node_origins(&mut origins).map_err(|e| e.what().to_string())?;
+    leaves.node_inside(&mut inside).map_err(|e| e.what().to_string())?;
+    let (origins, _) = origins.as_chunks::<3>();
+    for (origin, words) in origins.iter().zip(inside.chunks_exact(NODE_WORDS)) {
+        for (word, &bits) in words.iter().enumerate() {
+            // A word holds four rows of 16 slots along z: one call a run of inside slots.
+            for row in 0..4 {
+                let mut bits = (bits >> (16 * row)) as u16;
+                let (x, y) = (word as i32 / 4, word as i32 % 4 * 4 + row);
+                let mut z = 0;
+                while bits != 0 {
+                    let gap = bits.trailing_zeros();
+                    let run = (bits >> gap).trailing_ones();
+                    z += gap as i32;
+                    let lo = IVec3::from_array(*origin) + IVec3::new(x, y, z) * LEAF_DIM;
+                    grid.set_sign(lo, lo + IVec3::new(1, 1, run as i32) * LEAF_DIM, true);
+                    z += run as i32;
+                    bits = bits.checked_shr(gap + run).unwrap_or(0);
+                }
+            }
+        }
+    }
+    for tile in leaves.tiles().map_err(|e| e.what().to_string())? {
+        let lo = IVec3::new(tile.x, tile.y, tile.z);
+        if tile.value < 0.0 && tile.size > 8 {
+            if lo.abs().max_element() > MAX_COORD - tile.size as i32 {
+                return Err(format!("it is solid at voxel {lo}; coordinates go to ±{MAX_COORD}"));
+            }
+            grid.set_sign(lo, lo + IVec3::splat(tile.size as i32), true);
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,258 @@
+//! Writing: to a temporary file beside the target, flushed, read back, compared, renamed.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use cxx::UniquePtr;
+use rayon::prelude::*;
+
+use super::bridge::ffi;
+use super::listing::{Compression, Precision};
+use super::read::{PIPE, VdbFile};
+use crate::atomic::Unfinished;
+use crate::error::{EditError, Result};
+use crate::grid::{Grid, Transform};
+use crate::levelset::LevelSet;
+
+/// How a file is written. The default keeps what the input had, else float and blosc.
+#[derive(Clone, Debug, Default)]
+pub struct WriteOptions {
+    /// How the values of the written level sets are stored; `None` keeps that of the grid they replace.
+    pub precision: Option<Precision>,
+    /// How the file is compressed; `None` keeps that of the input.
+    pub compression: Option<Compression>,
+    /// Leaves the other grids of the input out.
+    pub only_result: bool,
+}
+
+/// A level set on its way to a file.
+#[derive(Clone, Copy)]
+pub struct GridToWrite<'a> {
+    /// The level set.
+    pub level_set: &'a LevelSet,
+    /// Its name; `None` keeps that of the grid it replaces, else the grid is unnamed.
+    pub name: Option<&'a str>,
+    /// The grid of the input, by its place in the file, whose metadata it takes over and in whose place it is written.
+    pub replaces: Option<usize>,
+}
+
+/// What was written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WriteReport {
+    /// Size of the file.
+    pub bytes: u64,
+    /// Number of grids in it.
+    pub grids: usize,
+    /// What is not as asked, and why.
+    pub warnings: Vec<String>,
+}
+
+/// Writes level sets, and with them the metadata and all other grids of `input`, to `path`; `-` is standard output.
+///
+/// What is there already is replaced only when the new file is complete, on disk, and was found to hold what was meant to be
+/// written. Any failure leaves the target as it was and nothing else behind.
+pub fn write(
+    path: impl AsRef<Path>,
+    grids: &[GridToWrite<'_>],
+    input: Option<&VdbFile>,
+    options: &WriteOptions,
+) -> Result<WriteReport> {
+    let path = path.as_ref();
+    let output = Target { path };
+    let compression = options.compression.or_else(|| Compression::of_all(&input?.listing().grids));
+    let compression = compression.unwrap_or(Compression::Blosc);
+    let (mut content, count) = collect(grids, input, options).map_err(|e| output.error(e.what()))?;
+    let bytes = output.write(content.pin_mut(), compression.flags())?;
+    let mut warnings: Vec<_> =
+        ffi::take_log().map_err(|e| output.error(e.what()))?.lines().map(str::to_string).collect();
+    if compression == Compression::Zip && !grids.is_empty() {
+        warnings.push("OpenVDB does not zip level sets: they are stored uncompressed".into());
+    }
+    Ok(WriteReport { bytes, grids: count, warnings })
+}
+
+/// All grids of the file to be, in order.
+fn collect(
+    grids: &[GridToWrite<'_>],
+    input: Option<&VdbFile>,
+    options: &WriteOptions,
+) -> Result<(UniquePtr<ffi::Output>, usize), cxx::Exception> {
+    let mut content = ffi::new_output()?;
+    let mut count = 0;
+    if let Some(file) = input {
+        content.pin_mut().carry_metadata(&file.archive)?;
+        for index in 0..file.listing().grids.len() {
+            if let Some(grid) = grids.iter().find(|g| g.replaces == Some(index)) {
+                content.pin_mut().add_grid(to_openvdb_grid(grid, input, options)?)?;
+            } else if !options.only_result {
+                content.pin_mut().carry_grid(&file.archive, index)?;
+            } else {
+                continue;
+            }
+            count += 1;
+        }
+    }
+    let known = input.map_or(0, |file| file.listing().grids.len());
+    for grid in grids.iter().filter(|g| g.replaces.is_none_or(|index| index >= known)) {
+        content.pin_mut().add_grid(to_openvdb_grid(grid, None, options)?)?;
+        count += 1;
+    }
+    Ok((content, count))
+}
+
+fn to_openvdb_grid(
+    grid: &GridToWrite<'_>,
+    input: Option<&VdbFile>,
+    options: &WriteOptions,
+) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
+    let mut made = to_openvdb(grid.level_set)?;
+    let mut precision = options.precision;
+    if let (Some(file), Some(index)) = (input, grid.replaces) {
+        let listing = &file.listing().grids[index];
+        // The very transform of the input if it is still the same: its kind and every bit of it stay.
+        let same = listing.to_world == Some(grid.level_set.transform().to_world());
+        made.pin_mut().carry(&file.archive, index, same)?;
+        precision = precision.or(Some(listing.precision));
+    } else {
+        made.pin_mut().set_creator(concat!("vdb-edit ", env!("CARGO_PKG_VERSION")))?;
+    }
+    if let Some(name) = grid.name {
+        made.pin_mut().set_name(name)?;
+    }
+    made.pin_mut().set_half(precision == Some(Precision::Half))?;
+    Ok(made)
+}
+
+/// A copy of a level set in OpenVDB's own tree: all leaves, and the inside as tiles.
+pub(super) fn to_openvdb(level_set: &LevelSet) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
+    let grid = level_set.grid();
+    let mut made = ffi::new_level_set(f64::from(grid.background()))?;
+    fill(made.pin_mut(), grid)?;
+    made.pin_mut().set_affine(&matrix(level_set.transform()))?;
+    Ok(made)
+}
+
+/// Row-major 4x4 that acts on columns.
+pub(super) fn matrix(transform: &Transform) -> [f64; 16] {
+    let m = transform.to_world();
+    let [x, y, z, t] = [m.matrix3.x_axis, m.matrix3.y_axis, m.matrix3.z_axis, m.translation];
+    [x.x, y.x, z.x, t.x, x.y, y.y, z.y, t.y, x.z, y.z, z.z, t.z, 0.0, 0.0, 0.0, 1.0]
+}
+
+fn fill(mut made: std::pin::Pin<&mut ffi::FloatGrid>, grid: &Grid) -> Result<(), cxx::Exception> {
+    let ids = grid.leaves();
+    let origins: Vec<i32> = ids.iter().flat_map(|&id| grid.origin(id).to_array()).collect();
+    made.as_mut().add_leaves(&origins)?;
+    let made_ref = made.as_ref().get_ref();
+    ids.par_iter().with_min_len(16).enumerate().try_for_each(|(index, &id)| {
+        // SAFETY: every task fills another leaf.
+        unsafe { made_ref.fill(index, &grid.values(id).0, &grid.mask(id).0) }
+    })?;
+    let value = -grid.background();
+    let tiles: Vec<ffi::Tile> = grid
+        .inside_tiles()
+        .into_iter()
+        .map(|(o, edge)| ffi::Tile { x: o.x, y: o.y, z: o.z, size: edge.unsigned_abs(), value, active: false })
+        .collect();
+    made.add_tiles(&tiles)
+}
+
+/// Where a file goes.
+struct Target<'a> {
+    path: &'a Path,
+}
+
+impl Target<'_> {
+    fn error(&self, problem: impl Into<String>) -> EditError {
+        EditError::output(self.path, problem)
+    }
+
+    fn io(&self, what: &str) -> impl Fn(std::io::Error) -> EditError {
+        move |e| self.error(format!("{what}: {e}"))
+    }
+
+    /// Writes and verifies; returns the size.
+    fn write(&self, content: std::pin::Pin<&mut ffi::Output>, compression: u32) -> Result<u64> {
+        if self.path == Path::new(PIPE) {
+            return self.write_through(content, compression, std::io::stdout().lock());
+        }
+        // Through a link to the file that it names; that file is what is replaced.
+        let real = std::fs::canonicalize(self.path).unwrap_or_else(|_| self.path.to_path_buf());
+        match std::fs::metadata(&real) {
+            Ok(facts) if facts.is_dir() => Err(self.error("it is a directory")),
+            Ok(facts) if !facts.is_file() => {
+                let device =
+                    std::fs::OpenOptions::new().write(true).open(&real).map_err(self.io("cannot be opened"))?;
+                self.write_through(content, compression, device)
+            }
+            facts => self.replace(content, compression, &real, facts.ok()),
+        }
+    }
+
+    /// To a pipe or device: verified in memory first.
+    fn write_through(
+        &self,
+        mut content: std::pin::Pin<&mut ffi::Output>,
+        compression: u32,
+        mut to: impl Write,
+    ) -> Result<u64> {
+        let bytes = content.as_mut().write_bytes(compression).map_err(|e| self.error(e.what()))?;
+        content.as_mut().seal().map_err(|e| self.error(e.what()))?;
+        self.verify(&content, || ffi::read_bytes(bytes.as_bytes(), false))?;
+        to.write_all(bytes.as_bytes()).and_then(|()| to.flush()).map_err(self.io("writing"))?;
+        Ok(bytes.len() as u64)
+    }
+
+    fn replace(
+        &self,
+        mut content: std::pin::Pin<&mut ffi::Output>,
+        compression: u32,
+        real: &Path,
+        old: Option<std::fs::Metadata>,
+    ) -> Result<u64> {
+        let folder = match real.parent() {
+            Some(parent) if !parent.as_os_str().is_empty() => parent.to_path_buf(),
+            _ => PathBuf::from("."),
+        };
+        let in_folder = format!("no file can be made in {}", folder.display());
+        let temporary = new_file_in(&folder).map_err(self.io(&in_folder))?;
+        let _unfinished = Unfinished::new(temporary.path());
+        let name = temporary.path().as_os_str().as_encoded_bytes();
+        content.as_mut().write_path(name, compression).map_err(|e| self.error(e.what()))?;
+        temporary.as_file().sync_all().map_err(self.io("flushing"))?;
+        // Before reading back, so that the two copies are never in memory together.
+        content.as_mut().seal().map_err(|e| self.error(e.what()))?;
+        self.verify(&content, || ffi::read_path(name, false))?;
+        let bytes = temporary.as_file().metadata().map_err(self.io("flushing"))?.len();
+        if let Some(old) = old {
+            temporary.as_file().set_permissions(old.permissions()).map_err(self.io("setting its permissions"))?;
+        }
+        temporary.persist(real).map_err(|e| self.io("renaming")(e.error))?;
+        // So that the new name survives a power failure; not every file system can, and the content is safe either way.
+        let _ = std::fs::File::open(&folder).and_then(|f| f.sync_all());
+        Ok(bytes)
+    }
+
+    fn verify(
+        &self,
+        content: &ffi::Output,
+        read_back: impl FnOnce() -> Result<UniquePtr<ffi::Archive>, cxx::Exception>,
+    ) -> Result<()> {
+        let failed = |problem: &str| self.error(format!("what was written does not read back: {problem}"));
+        let archive = read_back().map_err(|e| failed(e.what()))?;
+        let difference = content.verify(&archive).map_err(|e| failed(e.what()))?;
+        if difference.is_empty() { Ok(()) } else { Err(failed(&difference)) }
+    }
+}
+
+fn new_file_in(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".vdb-edit-").suffix(".tmp");
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        // As any new file, subject to the umask; temporary files are private otherwise.
+        builder.permissions(std::fs::Permissions::from_mode(0o666));
+    }
+    builder.tempfile_in(folder)
+}
