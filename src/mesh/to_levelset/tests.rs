@@ -199,6 +199,7 @@ fn nasty_meshes_become_valid_level_sets_or_clear_errors() {
             }
             Ok((level_set, findings)) => {
                 assert!(check_valid(&level_set) > 0.0);
+                surprises.extend(level_set.check().iter().map(|violation| format!("{file}: {violation:?}")));
                 let warnings = findings.warnings().join("; ");
                 if !warnings.contains(word) || word.is_empty() != warnings.is_empty() {
                     surprises.push(format!("{file}: {warnings}"));
