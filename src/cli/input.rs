@@ -209,6 +209,7 @@ pub fn load(
 
 /// Reads a mesh file.
 pub fn read_mesh(path: &Path, warnings: &mut Vec<String>) -> Result<TriangleMesh> {
+    mesh_format(path)?;
     let read = mesh::read(path)?;
     warnings.extend(read.warnings.into_iter().map(|w| format!("{}: {w}", path.display())));
     Ok(read.mesh)
