@@ -1,133 +1,27 @@
 //! Whether a level set is one: its invariants, verified voxel by voxel and pair by pair.
 //!
 //! A valid field passes: exact distances of any shape, sharp or thin, and plain min/max of valid fields, whose values
-//! are bounds of the distance but not distances. Such fields are 1-Lipschitz, and the |∇φ| of a bound may vanish on one side of the surface
-//! (on the seam between two united solids) but not on both. So steepness is judged between face neighbours everywhere, and flatness
-//! only across the surface, on the steeper side of each crossed grid edge, by Godunov's upwind |∇φ|.
+//! are bounds of the distance but not distances. Such fields are 1-Lipschitz, and the |∇φ| of a bound may vanish on
+//! one side of the surface (on the seam between two united solids) but not on both. So steepness is judged between
+//! face neighbours everywhere, and flatness only across the surface, on the steeper side of each crossed grid edge,
+//! by Godunov's upwind |∇φ|.
 //!
 //! One pass over the leaves, in parallel; counts and examples do not depend on the number of threads.
 
-use std::fmt;
-
 use glam::IVec3;
 use rayon::prelude::*;
-use serde::Serialize;
 
 use super::LevelSet;
+use super::violation::{FLATTEST, STEEPEST, Violation, ViolationKind};
 use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, neighbour_index, offset_to_local};
 use crate::stencil::upwind::godunov_first;
 use crate::stencil::{Halo, Row};
 
-/// Largest difference between face neighbours, in voxels. Exact fields reach 1, evolved ones a little more where a front
-/// sharpens; the limit is that of OpenVDB's own checker for |∇φ|.
-const STEEPEST: f32 = 1.5;
-
-/// Smallest |∇φ| at the surface: OpenVDB's limit.
-const FLATTEST: f32 = 0.5;
-
-/// Part of all crossed edges that may be flatter: where three or more surfaces of a CSG expression meet, single ones are.
-const FLAT_FRACTION: f64 = 0.01;
-
-/// Relative slack on |φ| < background: values that went through half precision may round up to it.
-const BACKGROUND_SLACK: f32 = 1e-3;
-
-/// Which invariant does not hold.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
-#[serde(rename_all = "snake_case")]
-#[non_exhaustive]
-pub enum ViolationKind {
-    /// A value is NaN or infinite.
-    NonFinite,
-    /// An active voxel has |φ| beyond the background.
-    ActiveBeyondBackground,
-    /// An inactive voxel of a leaf is neither +background nor −background.
-    InactiveNotBackground,
-    /// φ changes its sign between face neighbours of which at least one is inactive: the surface leaves the band.
-    HoleInBand,
-    /// An inactive voxel or an absent leaf differs in sign from the absent leaf beside it.
-    SignMismatch,
-    /// Active face neighbours differ by more than 1.5 voxels.
-    TooSteep,
-    /// |∇φ| < 0.5 on both sides of the surface.
-    TooFlat,
-    /// The band ends before |φ| reaches the background.
-    BandTooNarrow,
-    /// A leaf without active voxels and of one sign is stored.
-    EmptyLeaf,
-}
-
-impl ViolationKind {
-    const ALL: [Self; 9] = [
-        Self::NonFinite,
-        Self::ActiveBeyondBackground,
-        Self::InactiveNotBackground,
-        Self::HoleInBand,
-        Self::SignMismatch,
-        Self::TooSteep,
-        Self::TooFlat,
-        Self::BandTooNarrow,
-        Self::EmptyLeaf,
-    ];
-}
-
-/// One invariant that does not hold, and where.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Violation {
-    /// The invariant.
-    pub kind: ViolationKind,
-    /// How often: voxels, pairs of voxels, or leaves.
-    pub count: u64,
-    /// The first place, by leaf.
-    pub example_ijk: IVec3,
-    /// The worst value found: φ, the difference of a pair, both in voxels, or |∇φ|.
-    pub worst: f32,
-}
-
-impl fmt::Display for Violation {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { kind, count, worst, example_ijk: IVec3 { x, y, z } } = self;
-        match kind {
-            ViolationKind::NonFinite => write!(f, "{count} values are not finite")?,
-            ViolationKind::ActiveBeyondBackground => {
-                write!(f, "{count} active voxels lie beyond the background (up to |phi| = {worst:.3} voxels)")?;
-            }
-            ViolationKind::InactiveNotBackground => {
-                write!(f, "{count} inactive voxels are not +-background (one is {worst:.3} voxels)")?;
-            }
-            ViolationKind::HoleInBand => write!(f, "the surface leaves the band between {count} pairs of voxels")?,
-            ViolationKind::SignMismatch => write!(f, "the space beside {count} voxels has the opposite sign")?,
-            ViolationKind::TooSteep => {
-                write!(
-                    f,
-                    "{count} pairs of neighbours differ by more than {STEEPEST} voxels (up to {worst:.3}): not a distance"
-                )?;
-            }
-            ViolationKind::TooFlat => {
-                write!(
-                    f,
-                    "|grad phi| is below {FLATTEST} at {count} places of the surface (down to {worst:.3}): not a distance"
-                )?;
-            }
-            ViolationKind::BandTooNarrow => {
-                write!(f, "the band ends {worst:.3} voxels short of the background beside {count} voxels")?;
-            }
-            ViolationKind::EmptyLeaf => write!(f, "{count} leaves without active voxels are stored")?,
-        }
-        let remedy = match kind {
-            ViolationKind::NonFinite | ViolationKind::HoleInBand => "--repair rebuilds it where the surface is closed",
-            ViolationKind::SignMismatch => "--repair fills the signs again",
-            ViolationKind::EmptyLeaf => "harmless; --repair removes them",
-            ViolationKind::ActiveBeyondBackground | ViolationKind::InactiveNotBackground => {
-                "--repair trims the band, `rebuild` makes it anew"
-            }
-            ViolationKind::TooSteep | ViolationKind::TooFlat => {
-                "`renormalize` restores small errors, `rebuild` or --repair any"
-            }
-            ViolationKind::BandTooNarrow => "`rebuild` or --repair widens it",
-        };
-        write!(f, ", first at voxel {x},{y},{z}; {remedy}")
-    }
-}
+/// Part of all crossed edges, and a number besides, that may be flatter on both sides: where three or more surfaces
+/// of a CSG expression meet, single ones are (measured: up to 1.4 % in random expressions of seven solids, none in
+/// exact fields).
+const FLAT_FRACTION: f64 = 0.05;
+const FLAT_ALWAYS: f64 = 8.0;
 
 impl LevelSet {
     /// Every invariant that does not hold, in the order of [`ViolationKind`]; empty for a valid level set.
@@ -140,7 +34,9 @@ impl LevelSet {
         });
         // Rayon keeps the order of the leaves, in whatever pieces they come: the first example stays the first.
         let mut findings = leaves.reduce(Findings::default, Findings::merge).merge(check_tiles(grid));
-        if (findings.found[ViolationKind::TooFlat as usize].count as f64) <= FLAT_FRACTION * findings.crossed as f64 {
+        if (findings.found[ViolationKind::TooFlat as usize].count as f64)
+            <= FLAT_ALWAYS + FLAT_FRACTION * findings.crossed as f64
+        {
             findings.found[ViolationKind::TooFlat as usize] = Found::default();
         }
         ViolationKind::ALL
@@ -237,25 +133,23 @@ impl LeafCheck<'_> {
         let mask = self.grid.mask(self.id);
         let background = self.grid.background();
         let values = &self.grid.values(self.id).0;
-        for x in 0..8 {
-            for y in 0..8 {
-                let (first, active) = (x * 64 + y * 8, mask.row(x, y));
-                for (z, &v) in values[first..first + 8].iter().enumerate() {
-                    let kind = if !v.is_finite() {
-                        ViolationKind::NonFinite
-                    } else if active >> z & 1 == 0 {
-                        if v.abs() == background {
-                            continue;
-                        }
-                        ViolationKind::InactiveNotBackground
-                    } else if v.abs() > background * (1.0 + BACKGROUND_SLACK) {
-                        ViolationKind::ActiveBeyondBackground
-                    } else {
-                        continue;
-                    };
-                    let badness = (v.abs() - background).abs();
-                    self.findings.add(kind, self.origin + offset_to_local(first + z), v / self.voxel_size, badness);
-                }
+        for (row, eight) in values.chunks_exact(8).enumerate() {
+            let active = mask.row(row / 8, row % 8);
+            let (mut non_finite, mut within, mut at) = (0u8, 0u8, 0u8);
+            for (z, v) in eight.iter().enumerate() {
+                non_finite |= u8::from(!v.is_finite()) << z;
+                within |= u8::from(v.abs() < background) << z;
+                at |= u8::from(v.abs() == background) << z;
+            }
+            for (kind, bits) in [
+                (ViolationKind::NonFinite, non_finite),
+                (ViolationKind::ActiveOutsideBand, active & !within & !non_finite),
+                (ViolationKind::InactiveNotBackground, !active & !at & !non_finite),
+            ] {
+                for_each_bit(bits, |z| {
+                    let (ijk, value) = (self.origin + offset_to_local(row * 8 + z), eight[z]);
+                    self.findings.add(kind, ijk, value / self.voxel_size, (value.abs() - background).abs());
+                });
             }
         }
         let inside = values[0] < 0.0;
@@ -264,7 +158,8 @@ impl LeafCheck<'_> {
         }
     }
 
-    /// Checks the pairs across `face`: all of the leaf on an upper side, only those with the absent leaf on a lower side.
+    /// Checks the pairs across `face`: all of the leaf on an upper side, only those with the absent leaf on a lower
+    /// side.
     fn pairs(&mut self, halo: &Halo<10>, face: Face, beyond: LeafId) {
         let mask = self.grid.mask(self.id);
         let other = self.grid.mask(beyond);
@@ -319,35 +214,36 @@ impl LeafCheck<'_> {
             (ViolationKind::TooSteep, steep & both),
             (ViolationKind::BandTooNarrow, steep & one_active & !crossed),
         ] {
-            let mut rest = bits & asked;
-            while rest != 0 {
-                let z = rest.trailing_zeros() as usize;
-                rest &= rest - 1;
+            for_each_bit(bits & asked, |z| {
                 let difference = (values[z] - others[z]).abs() / self.voxel_size;
                 self.findings.add(kind, self.origin + offset_to_local(first + z), difference, difference);
-            }
+            });
         }
     }
 
-    /// Checks |∇φ| on the steeper side of each crossed edge within the leaf. Edges between leaves are left out: no leaf has
-    /// the gradient on both sides, and the inner ones are enough to judge the field.
+    /// Checks |∇φ| on the steeper side of each crossed edge within the leaf. Edges between leaves are left out: no
+    /// leaf has the gradient on both sides, and the inner ones are enough to judge the field.
     fn flatness(&mut self, halo: &Halo<10>) {
         let mask = self.grid.mask(self.id);
         let values = &self.grid.values(self.id).0;
         let inside = LeafMask(std::array::from_fn(|x| {
             values[x * 64..(x + 1) * 64].iter().enumerate().fold(0, |w, (b, v)| w | u64::from(*v < 0.0) << b)
         }));
-        if inside.is_empty() || inside == LeafMask::FULL {
+        let outside = LeafMask(inside.0.map(|w| !w));
+        let [crossed_inside, crossed_outside] =
+            [(inside, outside), (outside, inside)].map(|(side, other)| side.zip(other.dilated(), |a, b| a & b));
+        let crossed = crossed_inside.zip(crossed_outside, |a, b| a | b);
+        if crossed.is_empty() {
             return;
         }
         let mut squared = [[[0.0; 8]; 8]; 8];
         for (x, slice) in squared.iter_mut().enumerate() {
-            for (y, row) in slice.iter_mut().enumerate() {
+            for (y, row) in slice.iter_mut().enumerate().filter(|(y, _)| crossed.row(x, *y) != 0) {
                 *row = godunov_first(halo, x, y);
             }
         }
         let at = |p: IVec3| squared[p.x as usize][p.y as usize][p.z as usize];
-        for offset in inside.zip(mask, |s, a| s & a).iter() {
+        for offset in crossed_inside.zip(mask, |s, a| s & a).iter() {
             let voxel = offset_to_local(offset);
             for face in Face::ALL {
                 let beside = voxel + face.step();
@@ -362,6 +258,15 @@ impl LeafCheck<'_> {
                 }
             }
         }
+    }
+}
+
+/// Calls `f` with the place of each bit that is set.
+#[inline(always)]
+fn for_each_bit(mut bits: u8, mut f: impl FnMut(usize)) {
+    while bits != 0 {
+        f(bits.trailing_zeros() as usize);
+        bits &= bits - 1;
     }
 }
 
@@ -448,6 +353,37 @@ mod tests {
     }
 
     #[test]
+    fn any_csg_expression_passes() {
+        let mut state = 1u64;
+        let mut random = move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) as f64 / f64::from(1u32 << 31)
+        };
+        for trial in 0..30 {
+            // Half of the expressions stand on whole voxels, where faces coincide.
+            let place = |r: f64, scale: f64| if trial % 2 == 0 { (r * scale).round() } else { r * scale };
+            let parts: Vec<_> = (0..7)
+                .map(|_| {
+                    let mut v = || place(random(), 16.0) - 8.0;
+                    let centre = DVec3::new(v(), v(), v());
+                    let half = DVec3::new(v(), v(), v()).abs() * 0.75 + 1.0;
+                    (centre, half, (random() * 6.0) as u32)
+                })
+                .collect();
+            let level_set = sampled(24, |p| {
+                parts.iter().fold(f64::INFINITY, |phi, &(centre, half, kind)| {
+                    let part = if kind < 3 { box_distance(p - centre, half) } else { (p - centre).length() - half.x };
+                    match kind % 3 {
+                        0 | 1 => phi.min(part),
+                        _ => phi.max(-part),
+                    }
+                })
+            });
+            assert_eq!(level_set.check(), [], "expression {trial}: {parts:?}");
+        }
+    }
+
+    #[test]
     fn wrong_data_is_named() {
         use ViolationKind::*;
         let good = ball(DVec3::ZERO, 20.0);
@@ -498,7 +434,7 @@ mod tests {
         let nan = with(f32::NAN, true).check();
         assert_eq!((nan[0].kind, nan[0].count, nan[0].example_ijk), (NonFinite, 1, at));
         assert_eq!(kinds(&with(f32::INFINITY, true))[0], NonFinite);
-        assert_eq!(kinds(&with(5.0, true)), [ActiveBeyondBackground, TooSteep]);
+        assert_eq!(kinds(&with(5.0, true)), [ActiveOutsideBand, TooSteep]);
         let hole = with(-3.0, false).check();
         let found = hole.iter().find(|v| v.kind == HoleInBand).unwrap();
         assert!(found.count >= 1 && (found.example_ijk - at).abs().element_sum() <= 1, "{hole:?}");

@@ -1,7 +1,8 @@
 //! Connected parts of the inside: 6 neighbours, as the surface separates them.
 //!
-//! Each leaf is split into its own connected parts by bit masks, and the solid space between leaves into runs of absent leaves
-//! along z; parts and runs that touch are then joined. A large interior costs one run a column of leaves, not its voxels.
+//! Each leaf is split into its own connected parts by bit masks, and the solid space between leaves into runs of
+//! absent leaves along z; parts and runs that touch are then joined. A large interior costs one run a column of
+//! leaves, not its voxels.
 
 use glam::IVec3;
 use rayon::prelude::*;
@@ -69,6 +70,11 @@ pub(super) fn count(grid: &Grid, surface: &IsoSurface) -> u64 {
     sets.count()
 }
 
+/// Bytes that [`count`] needs, where few leaves have more than one part.
+pub(super) fn bytes_needed(grid: &Grid) -> u64 {
+    (grid.leaves().len() * (size_of::<Parts>() + 3 * size_of::<u32>())) as u64
+}
+
 /// The connected parts of one leaf's inside: rarely more than one.
 type Parts = SmallVec<[LeafMask; 1]>;
 
@@ -101,7 +107,8 @@ struct Run {
 /// The runs of all tiles (by origin, with their edges), sorted by origin.
 fn runs_of(tiles: &[(IVec3, i32)]) -> Vec<Run> {
     let (large, small): (Vec<_>, Vec<_>) = tiles.iter().copied().partition(|(_, edge)| *edge > LEAF_DIM);
-    // Tiles of one size come column by column; whole nodes are joined along z before they are cut into columns of leaves.
+    // Tiles of one size come column by column; whole nodes are joined along z before they are cut into columns of
+    // leaves.
     let mut runs = join_along_z(small.into_iter().map(|(origin, edge)| Run { origin, end: origin.z + edge }));
     for (edge, tower) in towers(&large) {
         for x in (0..edge).step_by(LEAF_DIM as usize) {

@@ -1,10 +1,11 @@
 //! The cells that the surface φ = iso crosses, and the numbering of its vertices.
 //!
-//! A voxel is inside where φ < iso; a value of exactly iso (or NaN) is outside. A cell is the cube between eight voxels and
-//! belongs to the leaf of its first corner, and a vertex lies on each grid edge between an inside and an outside voxel and belongs
-//! to the leaf of the edge's first voxel. The vertices of a leaf are numbered by bit masks and ranks, so that a cell finds the
-//! vertices of its neighbours without a hash. The polygons of a cell are those of [`cell_case`](super::marching::cell_case):
-//! inside is connected through faces (6 neighbours), outside through faces and edges (18).
+//! A voxel is inside where φ < iso; a value of exactly iso (or NaN) is outside. A cell is the cube between eight
+//! voxels and belongs to the leaf of its first corner, and a vertex lies on each grid edge between an inside and an
+//! outside voxel and belongs to the leaf of the edge's first voxel. The vertices of a leaf are numbered by bit masks
+//! and ranks, so that a cell finds the vertices of its neighbours without a hash. The polygons of a cell are those of
+//! [`cell_case`](super::marching::cell_case): inside is connected through faces (6 neighbours), outside through faces
+//! and edges (18).
 
 use glam::{DVec3, IVec3};
 
@@ -13,9 +14,9 @@ use crate::error::{EditError, Result};
 use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, LeafValues, Neighbours, neighbour_index, offset_to_local};
 use crate::run::RunOptions;
 
-/// Vertices keep this distance, in voxels, from the ends of their grid edge, so that no two coincide and no triangle is
-/// degenerate where φ = iso at a voxel. Far below the accuracy of linear interpolation; still resolved by f32 files up to
-/// 4096 voxels from the origin.
+/// Vertices keep this distance, in voxels, from the ends of their grid edge, so that no two coincide and no triangle
+/// is degenerate where φ = iso at a voxel. Far below the accuracy of linear interpolation; still resolved by f32
+/// files up to 4096 voxels from the origin.
 pub(crate) const VERTEX_MARGIN: f64 = 1.0 / 4096.0;
 
 /// Where φ = iso between two voxels with values `a` and `b` on different sides, 0..1.
@@ -27,7 +28,8 @@ pub(crate) fn crossing(a: f32, b: f32, iso: f32) -> f64 {
     if t.is_nan() { 0.5 } else { t.clamp(VERTEX_MARGIN, 1.0 - VERTEX_MARGIN) }
 }
 
-/// The signs of a leaf's voxels and of those next to its upper sides: bit z (0..=8) of row (x, y) (0..=8) is set inside.
+/// The signs of a leaf's voxels and of those next to its upper sides: bit z (0..=8) of row (x, y) (0..=8) is set
+/// inside.
 pub(crate) struct SignRows([[u16; 9]; 9]);
 
 impl SignRows {
@@ -235,8 +237,8 @@ impl<'a> IsoSurface<'a> {
         });
     }
 
-    /// A voxel of this leaf whose sign differs from that of the absent leaf next to it: the surface leaves the stored leaves there
-    /// and cannot be followed. `None` everywhere on a valid level set.
+    /// A voxel of this leaf whose sign differs from that of the absent leaf next to it: the surface leaves the stored
+    /// leaves there and cannot be followed. `None` everywhere on a valid level set.
     pub fn leak(&self, id: LeafId) -> Option<IVec3> {
         let around = &self.grid.neighbours()[id.index()];
         let inside = self.signs[id.index()];
@@ -260,7 +262,8 @@ pub(crate) struct CellVertices<'a> {
 }
 
 impl CellVertices<'_> {
-    /// Number of the vertex on an edge of the cell with first corner `cell`; `None` if the edge belongs to an absent leaf.
+    /// Number of the vertex on an edge of the cell with first corner `cell`; `None` if the edge belongs to an absent
+    /// leaf.
     #[inline(always)]
     pub fn vertex(&self, cell: IVec3, edge: u8) -> Option<u32> {
         let (axis, first) = EDGES[usize::from(edge)];

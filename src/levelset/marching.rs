@@ -8,9 +8,9 @@
 //! surface, counter-clockwise seen from outside, for every sign field.
 //!
 //! Loops have 3 to 7 corners. They are triangulated without any diagonal between two edges of one cell face: such a
-//! diagonal could coincide with one of the neighbour, and four triangles would meet there. Every loop has such a triangulation.
-//! Each triangle edge is then either a segment, shared by exactly two cells, or a diagonal within one cell: the surface
-//! is manifold.
+//! diagonal could coincide with one of the neighbour, and four triangles would meet there. Every loop has such a
+//! triangulation. Each triangle edge is then either a segment, shared by exactly two cells, or a diagonal within one
+//! cell: the surface is manifold.
 
 use std::sync::LazyLock;
 
@@ -33,7 +33,8 @@ pub(crate) struct CellCase {
     pub triangles: Vec<[Edge; 3]>,
     /// Triangle edges on the faces of the cell.
     pub segments: Vec<Segment>,
-    /// Triangle edges within the cell: the crossed edges at both ends, and the two triangles, the one that follows the direction first.
+    /// Triangle edges within the cell: the crossed edges at both ends, and the two triangles, the one that follows
+    /// the direction first.
     pub diagonals: Vec<([Edge; 2], [u8; 2])>,
 }
 
@@ -152,7 +153,8 @@ fn derive(pattern: u8) -> CellCase {
     case
 }
 
-/// Triangles of the corners `first..=last` of a loop, without a diagonal in a cell face; `None` if there is no such way.
+/// Triangles of the corners `first..=last` of a loop, without a diagonal in a cell face; `None` if there is no such
+/// way.
 fn triangulate(outline: &[Edge], first: usize, last: usize) -> Option<Vec<[Edge; 3]>> {
     if last - first < 2 {
         return Some(Vec::new());

@@ -7,10 +7,11 @@
 //! > χ = loops − crossed grid edges: each vertex lies on a grid edge with four cells around it, so there are twice as many
 //! > segments as vertices, and V − E + F is V − 2V + loops.
 //!
-//! Area, volume and ∫ H dA converge to those of the true surface with the square of the voxel size where it is smooth; a
-//! sphere of R voxels is within 0.32 / R², 0.61 / R² and 0.12 / R² of them (measured, R = 10..40). Sharp edges are chamfered by less than
-//! a voxel, an error of first order in area. A solid ball with a cavity has one component, two surface
-//! components and χ = 4. Sums go by the order of leaves and do not depend on the number of threads.
+//! Area, volume and ∫ H dA converge to those of the true surface with the square of the voxel size where it is
+//! smooth; a sphere of R voxels is within 0.32 / R², 0.61 / R² and 0.12 / R² of them (measured, R = 10..40). Sharp
+//! edges are chamfered by less than a voxel, an error of first order in area. A solid ball with a cavity has one
+//! component, two surface components and χ = 4. Sums go by the order of leaves and do not depend on the number of
+//! threads.
 
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
@@ -44,7 +45,8 @@ pub struct Measures {
 }
 
 impl LevelSet {
-    /// Measures the zero set. What of the surface lies outside the stored leaves (see [`check`](Self::check)) is not seen.
+    /// Measures the zero set. What of the surface lies outside the stored leaves (see [`check`](Self::check)) is not
+    /// seen.
     pub fn measure(&self, run: &RunOptions) -> Result<Measures> {
         const OPERATION: &str = "measuring a level set";
         let surface = IsoSurface::new(self.grid(), 0.0, OPERATION, run)?;
@@ -71,6 +73,7 @@ impl LevelSet {
         measures.euler = loops - surface.vertex_count() as i64;
         measures.surface_components = surface_components(&surface);
         run.check(OPERATION)?;
+        run.reserve(OPERATION, components::bytes_needed(self.grid()), MEMORY_ADVICE)?;
         measures.components = components::count(self.grid(), &surface);
         Ok(measures)
     }
@@ -122,7 +125,8 @@ fn leaf_sums(grid: &Grid, surface: &IsoSurface, leaf: &SurfaceLeaf) -> Sums {
     sums
 }
 
-/// ½ · length · exterior angle of the edge `along`, which the triangle with normal `first` follows in its own direction.
+/// ½ · length · exterior angle of the edge `along`, which the triangle with normal `first` follows in its own
+/// direction.
 fn edge_curvature(along: DVec3, first: DVec3, second: DVec3) -> f64 {
     let length = along.length();
     // The arguments need no unit normals: both carry the same factor.

@@ -1,7 +1,7 @@
 //! A surface as a narrow-band level set: signed distance φ near the surface, its sign everywhere.
 //!
 //! φ is in world units and negative inside. Voxels with |φ| < background are active and hold the distance, all others are
-//! ±background; background = half width · voxel size. `check` verifies these invariants.
+//! ±background; background = half width · voxel size. [`check`](LevelSet::check) verifies these invariants.
 
 mod build;
 mod check;
@@ -15,13 +15,14 @@ pub mod shapes;
 #[cfg(test)]
 pub(crate) mod testing;
 mod union_find;
+mod violation;
 
 use glam::{DVec3, IVec3};
 
 pub(crate) use build::grid_of_leaves;
-pub use check::{Violation, ViolationKind};
 pub use measure::Measures;
 pub use sample::Sampler;
+pub use violation::{Violation, ViolationKind};
 
 use crate::grid::{Grid, Transform};
 

@@ -85,8 +85,7 @@ impl<'a> Sampler<'a> {
 
 /// The cell and the position in it; `None` where the position is not finite or too far away for an index.
 fn split(ijk: DVec3) -> Option<(IVec3, DVec3)> {
-    // A comparison that NaN fails as well.
-    if !(ijk.abs().max_element() < FARTHEST) || ijk.is_nan() {
+    if ijk.is_nan() || ijk.abs().max_element() >= FARTHEST {
         return None;
     }
     let floor = ijk.floor();

@@ -29,7 +29,8 @@ pub fn box_distance(p: DVec3, half: DVec3) -> f64 {
     q.max(DVec3::ZERO).length() + q.max_element().min(0.0)
 }
 
-/// A block of `leaves`³ leaves from the origin, all active inside its outermost layer of voxels, which is outside. Background 3.
+/// A block of `leaves`³ leaves from the origin, all active inside its outermost layer of voxels, which is outside.
+/// Background 3.
 pub fn block(leaves: i32, value: impl Fn(IVec3) -> f32) -> LevelSet {
     let mut all = Vec::new();
     for i in 0..leaves.pow(3) {

@@ -1,8 +1,8 @@
 //! Level set → triangle mesh: marching cubes with shared vertices.
 //!
-//! The mesh of a valid level set is closed, manifold and consistently oriented, whatever its signs (the argument is in
-//! `levelset::marching`). Vertices lie on grid edges by linear interpolation: within κ h²/8 of the true surface where φ is
-//! a distance. Numbers of vertices and triangles go by the order of leaves, not by threads.
+//! The mesh of a valid level set is closed, manifold and consistently oriented, whatever its signs (the argument is
+//! in `levelset::marching`). Vertices lie on grid edges by linear interpolation: within κ h²/8 of the true surface
+//! where φ is a distance. Numbers of vertices and triangles go by the order of leaves, not by threads.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -18,12 +18,13 @@ const OPERATION: &str = "level set to mesh";
 
 /// The surface φ = `iso` (world units, 0 for the level set's own) as a mesh in world units.
 ///
-/// |iso| must lie a voxel or more inside the band for an accurate surface, and below the background at all.
-/// Refused where the surface leaves the stored band: such a mesh would have holes.
+/// |iso| must be below the background, and a voxel below it for an accurate surface. Vertex attributes are not made.
+/// Refused where the surface leaves the stored band: such a mesh would have holes. Surfaces that lie between absent
+/// leaves altogether are not seen; [`LevelSet::check`] finds both.
 pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Result<TriangleMesh> {
     let grid = level_set.grid();
     let background = grid.background();
-    if !(iso.abs() < background) {
+    if iso.is_nan() || iso.abs() >= background {
         return Err(EditError::parameter(OPERATION, "iso", iso, format!("above -{background} and below {background}")));
     }
     let surface = IsoSurface::new(grid, iso, OPERATION, run)?;
@@ -74,12 +75,15 @@ fn leaves_the_band(place: String) -> EditError {
     }
 }
 
+/// A leaf, its vertices and its triangles.
+type Part<'a> = (&'a SurfaceLeaf, &'a mut [DVec3], &'a mut [[u32; 3]]);
+
 /// The part of both arrays that each leaf fills.
 fn split<'a>(
     leaves: &'a [SurfaceLeaf],
     mut positions: &'a mut [DVec3],
     mut triangles: &'a mut [[u32; 3]],
-) -> Vec<(&'a SurfaceLeaf, &'a mut [DVec3], &'a mut [[u32; 3]])> {
+) -> Vec<Part<'a>> {
     leaves
         .iter()
         .map(|leaf| {
@@ -120,8 +124,8 @@ mod tests {
         level_set_to_mesh(level_set, 0.0, &RunOptions::default()).unwrap()
     }
 
-    /// Asserts that every edge joins two triangles in opposite directions and that the triangles around every vertex form
-    /// one ring, that no triangle is degenerate, and returns V − E + F.
+    /// Asserts that every edge joins two triangles in opposite directions and that the triangles around every vertex
+    /// form one ring, that no triangle is degenerate, and returns V − E + F.
     fn assert_manifold(mesh: &TriangleMesh) -> i64 {
         let mut sides = HashMap::new();
         let mut around = vec![Vec::new(); mesh.positions.len()];
@@ -159,7 +163,8 @@ mod tests {
         let centre = DVec3::new(0.3, -0.2, 0.1);
         let sphere = mesh(&ball(centre, 20.0));
         assert_eq!(assert_manifold(&sphere), 2);
-        // A chord of a voxel's length sags κ h²/8; a linear crossing of the distance errs no more. Normals point outwards.
+        // A chord of a voxel's length sags κ h²/8; a linear crossing of the distance errs no more. Normals point
+        // outwards.
         for p in &sphere.positions {
             assert!(((*p - centre).length() - 20.0).abs() < 1.0 / (8.0 * 20.0) * 1.1);
         }

@@ -104,7 +104,8 @@ mod tests {
     /// The field x² − R² of a sphere, scaled: right zero set, wrong everywhere else (MATH 1.2).
     fn quadratic_sphere(radius: f64) -> LevelSet {
         let bounds = (IVec3::splat(-28), IVec3::splat(28));
-        let f = |p: DVec3| (p.length_squared() - radius * radius) / (2.0 * radius) * 0.9;
+        // Cut off where it would exceed the distance, which sampling relies on.
+        let f = |p: DVec3| ((p.length_squared() - radius * radius) / (2.0 * radius) * 0.9).clamp(-4.4, 4.4);
         LevelSet::from_distance(Transform::uniform(0.1), 4.0, bounds, f, &RunOptions::default()).unwrap()
     }
 
@@ -127,9 +128,9 @@ mod tests {
     fn rebuild_is_exact_and_renormalize_approaches_it() {
         let run = RunOptions::default();
         let bad = quadratic_sphere(20.0);
-        assert!(errors(&bad, 20.0, 3.0).1 > 0.3);
+        assert!(errors(&bad, 20.0, 3.0).1 > 0.3, "{:?}", errors(&bad, 20.0, 3.0));
         let rebuilt = RebuildDistance::default().apply(vec![bad.clone()], &run).unwrap().level_set;
-        // Polygons of a sphere of 20 voxels: up to 0.0125 voxel inside it; the start field adds its curvature along the edges.
+        // Polygons of a sphere of 20 voxels: up to 3/8·h²κ = 0.019 voxel inside it; the start field adds its curvature along the edges.
         assert!(errors(&rebuilt, 20.0, 3.0).1 < 0.03, "{:?}", errors(&rebuilt, 20.0, 3.0));
         let params = Renormalize { iterations: 20, ..Renormalize::default() };
         let renormalized = params.apply(vec![bad.clone()], &run).unwrap().level_set;
@@ -149,7 +150,8 @@ mod tests {
         let params = RebuildDistance { half_width: Some(9.0), iso: "2vx".parse().unwrap() };
         let wide = params.apply(vec![ball.clone()], &run).unwrap().level_set;
         assert_eq!(wide.half_width(), 9.0);
-        assert!(errors(&wide, 22.0, 9.0).1 < 0.014);
+        // 3/8·h²κ.
+        assert!(errors(&wide, 22.0, 9.0).1 < 0.375 / 22.0);
         let outside = RebuildDistance { half_width: None, iso: WorldLength::new(0.3) };
         assert!(outside.apply(vec![ball], &run).is_err(), "an iso value at the rim of the band has no surface");
     }

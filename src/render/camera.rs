@@ -153,8 +153,8 @@ pub(super) fn points_to_frame(level_set: &LevelSet, frame: Frame) -> Vec<(DVec3,
         .collect()
 }
 
-/// For every leaf with surface, the box of its voxels next to the surface: inside and less than a cell's diagonal from it,
-/// or outside and less than half a voxel. The box around the surface itself exceeds it by less than a voxel.
+/// For every leaf with surface, the box of its voxels less than a voxel from the surface: together they hold it, and exceed
+/// it by less than a voxel.
 fn surface_boxes(level_set: &LevelSet) -> Vec<(IVec3, IVec3)> {
     let grid = level_set.grid();
     let reach = level_set.voxel_size() as f32;

@@ -2,7 +2,7 @@
 
 use glam::{DVec3, IVec3};
 
-use crate::grid::{Grid, LeafId, Neighbours, leaf_offset, leaf_origin, neighbour_index};
+use crate::grid::{Grid, LEAF_DIM, LeafId, Neighbours, leaf_offset, leaf_origin};
 
 /// A level set's values with the tables that make neighbouring leaves cheap to read.
 pub(super) struct Field<'a> {
@@ -42,13 +42,19 @@ impl<'a> Field<'a> {
         Self { grid, neighbours: grid.neighbours(), to_voxels: 1.0 / voxel_size }
     }
 
+    /// Voxels per world unit.
+    #[inline(always)]
+    pub fn to_voxels(&self) -> f64 {
+        self.to_voxels
+    }
+
     /// A reader for one ray or pixel, which remembers the last leaf.
     pub fn cursor(&self) -> Cursor<'_> {
         Cursor { field: self, origin: IVec3::ZERO, id: self.grid.find(IVec3::ZERO) }
     }
 }
 
-/// Reads a [`Field`]. Positions are in index space, values in voxels.
+/// Reads a [`Field`]. Positions are in index space.
 pub(super) struct Cursor<'a> {
     field: &'a Field<'a>,
     origin: IVec3,
@@ -65,34 +71,47 @@ impl Cursor<'_> {
         }
     }
 
-    /// The leaf `step` leaves (−1, 0 or 1 along each axis) from the current one.
+    /// The leaf `q` around the current one, numbered as in [`Neighbours`].
     #[inline(always)]
-    fn beside(&self, step: IVec3) -> LeafId {
+    fn beside(&self, q: usize) -> LeafId {
         if self.id.is_sentinel() {
-            self.field.grid.find(self.origin + step * 8)
+            let q = q as i32;
+            self.field.grid.find(self.origin + IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1) * LEAF_DIM)
         } else {
-            self.field.neighbours[self.id.index()][neighbour_index(step)]
+            self.field.neighbours[self.id.index()][q]
         }
     }
 
-    /// φ at the corners of the cell with first corner `ijk`, in the order x·4 + y·2 + z.
+    /// φ (world units) at the corners of the cell with first corner `ijk`, in the order x·4 + y·2 + z.
     #[inline(always)]
-    pub fn cell(&mut self, ijk: IVec3) -> [f64; 8] {
+    pub fn cell(&mut self, ijk: IVec3) -> [f32; 8] {
         self.enter(ijk);
-        let grid = self.field.grid;
         let local = ijk - self.origin;
-        let corners = if local.max_element() < 7 {
-            let values = &grid.values(self.id).0[leaf_offset(ijk)..];
+        if local.max_element() < LEAF_DIM - 1 {
+            let values = &self.field.grid.values(self.id).0[leaf_offset(ijk)..];
             // Within one leaf x is 64 apart, y 8, z 1.
             [0, 1, 8, 9, 64, 65, 72, 73].map(|step| values[step])
         } else {
-            std::array::from_fn(|c| {
-                let c = c as i32;
-                let corner = local + IVec3::new(c >> 2, c >> 1 & 1, c & 1);
-                grid.values(self.beside(corner >> 3)).0[leaf_offset(corner)]
-            })
-        };
-        corners.map(|v| f64::from(v) * self.field.to_voxels)
+            self.border_cell(local)
+        }
+    }
+
+    /// [`cell`](Self::cell) where a corner lies beyond the leaf.
+    fn border_cell(&self, local: IVec3) -> [f32; 8] {
+        let mut corners = [0.0; 8];
+        for (c, corner) in corners.iter_mut().enumerate() {
+            let c = c as i32;
+            *corner = self.tap(local + IVec3::new(c >> 2, c >> 1 & 1, c & 1));
+        }
+        corners
+    }
+
+    /// The voxel at `local` relative to the current leaf, at most a leaf away.
+    #[inline(always)]
+    fn tap(&self, local: IVec3) -> f32 {
+        let leaf: IVec3 = local >> 3;
+        let id = self.beside((13 + leaf.x * 9 + leaf.y * 3 + leaf.z) as usize);
+        self.field.grid.values(id).0[leaf_offset(local)]
     }
 
     /// Derivatives of the cubic B-spline whose coefficients are the voxels (4³ taps).
@@ -106,48 +125,43 @@ impl Cursor<'_> {
         let part = ijk - floor;
         let [wx, wy, wz] = [part.x, part.y, part.z].map(spline_weights);
         let first = base - self.origin - 1;
-        let grid = self.field.grid;
         // Sums over z, then y, then x; the index is the order of the derivative along that axis.
         let mut gradient = DVec3::ZERO;
         let (mut diagonal, mut mixed) = (DVec3::ZERO, DVec3::ZERO);
-        for i in 0..4 {
+        for (i, x) in (0..).zip(wx) {
             let mut plane = [[0.0; 3]; 3];
-            for j in 0..4 {
+            for (j, y) in (0..).zip(wy) {
                 let mut row = [0.0; 3];
-                for k in 0..4 {
-                    let tap = first + IVec3::new(i as i32, j as i32, k as i32);
-                    let value = f64::from(grid.values(self.beside(tap >> 3)).0[leaf_offset(tap)]);
-                    for (sum, w) in row.iter_mut().zip(&wz) {
-                        *sum += w[k] * value;
+                for (k, z) in (0..).zip(wz) {
+                    let value = f64::from(self.tap(first + IVec3::new(i, j, k)));
+                    for (sum, w) in row.iter_mut().zip(z) {
+                        *sum += w * value;
                     }
                 }
-                for (sums, w) in plane.iter_mut().zip(&wy) {
+                for (sums, w) in plane.iter_mut().zip(y) {
                     for (sum, r) in sums.iter_mut().zip(row) {
-                        *sum += w[j] * r;
+                        *sum += w * r;
                     }
                 }
             }
-            gradient += DVec3::new(wx[1][i] * plane[0][0], wx[0][i] * plane[1][0], wx[0][i] * plane[0][1]);
-            diagonal += DVec3::new(wx[2][i] * plane[0][0], wx[0][i] * plane[2][0], wx[0][i] * plane[0][2]);
-            mixed += DVec3::new(wx[0][i] * plane[1][1], wx[1][i] * plane[0][1], wx[1][i] * plane[1][0]);
+            gradient += DVec3::new(x[1] * plane[0][0], x[0] * plane[1][0], x[0] * plane[0][1]);
+            diagonal += DVec3::new(x[2] * plane[0][0], x[0] * plane[2][0], x[0] * plane[0][2]);
+            mixed += DVec3::new(x[0] * plane[1][1], x[1] * plane[0][1], x[1] * plane[1][0]);
         }
         let s = self.field.to_voxels;
         Jet { gradient: gradient * s, diagonal: diagonal * s, mixed: mixed * s }
     }
 }
 
-/// Weights of the uniform cubic B-spline at `t` in 0..1 of the middle interval, and of its first and second derivative.
-fn spline_weights(t: f64) -> [[f64; 4]; 3] {
+/// Weights of the four taps of the uniform cubic B-spline at `t` in 0..1 of its middle interval, each with its first and
+/// second derivative.
+fn spline_weights(t: f64) -> [[f64; 3]; 4] {
     let u = 1.0 - t;
     [
-        [
-            u * u * u / 6.0,
-            (3.0 * t * t * t - 6.0 * t * t + 4.0) / 6.0,
-            (3.0 * u * u * u - 6.0 * u * u + 4.0) / 6.0,
-            t * t * t / 6.0,
-        ],
-        [-0.5 * u * u, 1.5 * t * t - 2.0 * t, 2.0 * u - 1.5 * u * u, 0.5 * t * t],
-        [u, 3.0 * t - 2.0, 3.0 * u - 2.0, t],
+        [u * u * u / 6.0, -0.5 * u * u, u],
+        [(3.0 * t * t * t - 6.0 * t * t + 4.0) / 6.0, 1.5 * t * t - 2.0 * t, 3.0 * t - 2.0],
+        [(3.0 * u * u * u - 6.0 * u * u + 4.0) / 6.0, 2.0 * u - 1.5 * u * u, 3.0 * u - 2.0],
+        [t * t * t / 6.0, 0.5 * t * t, t],
     ]
 }
 
@@ -192,7 +206,7 @@ mod tests {
                 for (c, v) in corners.into_iter().enumerate() {
                     let c = c as i32;
                     let ijk = cell + IVec3::new(c >> 2, c >> 1 & 1, c & 1);
-                    assert_eq!(v, f64::from(set.grid().voxel(ijk).0) / set.voxel_size());
+                    assert_eq!(v, set.grid().voxel(ijk).0);
                 }
             }
         }

@@ -5,15 +5,19 @@
 //! comes from the monotone pieces between its extremes (Marmitt et al. 2004), so that neighbouring pixels see one
 //! continuous surface, without steps. Distances along rays are in voxels.
 
-use glam::{DVec3, IVec3};
+use glam::{DVec3, IVec3, Vec3};
 
 use super::field::{Cursor, Field};
 use super::skip::SkipMap;
 
 /// Part of |φ| that a step takes: trilinear values may exceed the distance by a few hundredths of a voxel.
 const STEP: f64 = 0.9;
+/// Where all corners of a cell are farther from the surface (voxels), a step by |φ| may be longer than the cell.
+const HOP_FROM: f64 = 0.3;
 /// After a jump, rays go this far (voxels) into the next block, so that rounding cannot put them back.
 const NUDGE: f64 = 1e-7;
+/// Components of a direction below this are taken as 0.
+const PARALLEL: f64 = 1e-9;
 
 /// A ray in index space; `direction` is a unit vector.
 #[derive(Clone, Copy)]
@@ -25,8 +29,10 @@ pub(super) struct Ray {
 
 impl Ray {
     pub fn new(origin: DVec3, direction: DVec3) -> Self {
-        // A component of exactly 0 never leaves a box along its axis: a huge quotient says the same without NaN.
-        let inverse = direction.map(|d| if d.abs() < 1e-12 { 1e12f64.copysign(d) } else { 1.0 / d });
+        // A component this small moves the ray by nothing that matters, but its quotient would be all rounding: such a
+        // ray counts as parallel, and a huge quotient says that it never leaves a box along that axis.
+        let direction = direction.map(|d| if d.abs() < PARALLEL { 0.0 } else { d });
+        let inverse = direction.map(|d| if d == 0.0 { 1e30 } else { 1.0 / d });
         Self { origin, direction, inverse }
     }
 
@@ -41,6 +47,14 @@ impl Ray {
         let (a, b) = ((lo - self.origin) * self.inverse, (hi - self.origin) * self.inverse);
         (a.min(b).max_element(), a.max(b).min_element())
     }
+}
+
+/// Rounds down: the library's function is a call on machines without an instruction for it, and this is the inner loop.
+#[inline(always)]
+fn floor(p: DVec3) -> IVec3 {
+    let toward_zero = p.as_ivec3();
+    let above = p.cmplt(toward_zero.as_dvec3());
+    toward_zero - IVec3::select(above, IVec3::ONE, IVec3::ZERO)
 }
 
 /// Where a ray starts.
@@ -64,23 +78,30 @@ impl Scene<'_> {
         let (enter, leave) = ray.crossing(self.skip.bounds());
         let mut t = enter.max(0.0);
         let t_end = leave.min(t_end);
+        let to_voxels = self.field.to_voxels();
+        let reach = (HOP_FROM / to_voxels) as f32;
         let mut outside = start == Start::Outside;
         let step = ray.direction.map(|d| if d < 0.0 { -1.0 } else { 1.0 }).as_ivec3();
         let ahead = step.max(IVec3::ZERO).as_dvec3();
+        let mut nudge = NUDGE;
         while t < t_end {
-            let mut cell = ray.at(t).floor().as_ivec3();
+            let mut cell = floor(ray.at(t));
             let block = self.skip.block(cell);
             if let Some(empty) = self.skip.empty_around(block) {
-                t = ray.crossing(empty).1.max(t) + NUDGE;
+                let beyond = ray.crossing(empty).1 + NUDGE;
+                // Rounding may leave a grazing ray in the same block: growing steps get it out.
+                nudge = if beyond > t { NUDGE } else { 2.0 * nudge };
+                t = beyond.max(t + nudge);
                 continue;
             }
             // Distances at which the ray leaves the cell through its next x, y and z face.
             let mut faces = (cell.as_dvec3() + ahead - ray.origin) * ray.inverse;
             while t < t_end && self.skip.block(cell) == block {
                 let corners = cursor.cell(cell);
-                let nearest = corners.iter().fold(f64::INFINITY, |m, c| m.min(c.abs()));
+                let (low, high) = corners.iter().fold((f32::MAX, f32::MIN), |(l, h), &c| (l.min(c), h.max(c)));
                 let exit = faces.min_element();
-                if corners.iter().any(|c| *c < 0.0) != corners.iter().all(|c| *c < 0.0) {
+                if low < 0.0 && high >= 0.0 {
+                    let corners = corners.map(f64::from);
                     let cubic = Cubic::along(&corners, ray.at(t) - cell.as_dvec3(), ray.direction);
                     let length = (exit - t).max(0.0);
                     if outside && cubic.at(0.0) <= 0.0 {
@@ -90,19 +111,19 @@ impl Scene<'_> {
                         return (t + s < t_end).then_some(t + s);
                     }
                     outside = cubic.at(length) > 0.0;
-                } else if corners[0] < 0.0 {
+                } else if low < 0.0 {
                     if outside {
                         return Some(t);
                     }
                 } else {
                     outside = true;
                 }
-                if nearest > 1.0 {
-                    // All of the cell is farther from the surface than its nearest corner less its half diagonal.
-                    let hop = t + STEP * (nearest - 0.87);
+                if low > reach || high < -reach {
+                    let part = (ray.at(t) - cell.as_dvec3()).as_vec3();
+                    let hop = t + STEP * to_voxels * f64::from(interpolate(&corners, part).abs());
                     if hop > exit {
                         t = hop;
-                        cell = ray.at(t).floor().as_ivec3();
+                        cell = floor(ray.at(t));
                         faces = (cell.as_dvec3() + ahead - ray.origin) * ray.inverse;
                         continue;
                     }
@@ -124,6 +145,14 @@ impl Scene<'_> {
         }
         None
     }
+}
+
+/// Trilinear value at `part` of a cell.
+#[inline(always)]
+fn interpolate(corners: &[f32; 8], part: Vec3) -> f32 {
+    let lerp = |a: f32, b: f32, t: f32| a + (b - a) * t;
+    let z: [f32; 4] = std::array::from_fn(|i| lerp(corners[2 * i], corners[2 * i + 1], part.z));
+    lerp(lerp(z[0], z[1], part.y), lerp(z[2], z[3], part.y), part.x)
 }
 
 /// φ along a ray through one cell: c0 + c1 s + c2 s² + c3 s³.
@@ -186,7 +215,7 @@ impl Cubic {
                 b = s
             }
             let newton = s - value / (c1 + s * (2.0 * c2 + s * 3.0 * c3));
-            let next = if newton > a && newton < b { newton } else { 0.5 * (a + b) };
+            let next = if newton >= a && newton <= b { newton } else { 0.5 * (a + b) };
             if (next - s).abs() < 1e-9 {
                 return next;
             }

@@ -10,14 +10,14 @@ use super::camera::Camera;
 use super::occlusion::Visibility;
 
 /// Warm grey of modelling clay.
-pub(super) const CLAY: DVec3 = DVec3::new(0.56, 0.475, 0.41);
+pub(super) const CLAY: DVec3 = DVec3::new(0.44, 0.355, 0.30);
 
 /// Radiance of the lights; their sum puts lit clay at the bright end of the tone curve, short of its shoulder.
-const KEY: DVec3 = DVec3::new(1.62, 1.54, 1.42);
-const HEADLIGHT: DVec3 = DVec3::new(0.16, 0.165, 0.175);
+const KEY: DVec3 = DVec3::new(1.34, 1.265, 1.15);
+const HEADLIGHT: DVec3 = DVec3::new(0.09, 0.095, 0.10);
 const RIM: DVec3 = DVec3::new(0.75, 0.85, 1.0);
-const SKY_ABOVE: DVec3 = DVec3::new(0.60, 0.66, 0.74);
-const SKY_BELOW: DVec3 = DVec3::new(0.27, 0.235, 0.21);
+const SKY_ABOVE: DVec3 = DVec3::new(0.46, 0.51, 0.58);
+const SKY_BELOW: DVec3 = DVec3::new(0.17, 0.145, 0.13);
 
 /// Directions of the lights, world space, unit.
 pub(super) struct Lights {
@@ -29,13 +29,14 @@ pub(super) struct Lights {
 impl Lights {
     pub fn around(camera: &Camera) -> Self {
         let place = |x: f64, y: f64, z: f64| (camera.right * x + camera.up * y + camera.back * z).normalize();
-        Self { key: place(-0.55, 0.75, 0.62), rim: place(0.75, 0.5, -0.75), up: place(-0.15, 1.0, 0.25) }
+        Self { key: place(-0.75, 0.8, 0.5), rim: place(0.75, 0.5, -0.75), up: place(-0.15, 1.0, 0.25) }
     }
 }
 
 /// Light that leaves a clay surface with `normal` towards `view` (world, unit).
 pub(super) fn clay(lights: &Lights, albedo: DVec3, normal: DVec3, view: DVec3, seen: Visibility) -> DVec3 {
-    let key = KEY * (normal.dot(lights.key).max(0.0) * seen.key);
+    // The key light is large: where little of the sky is seen, part of the light is hidden as well.
+    let key = KEY * (normal.dot(lights.key).max(0.0) * seen.key * (0.5 + 0.5 * seen.sky));
     let head = HEADLIGHT * normal.dot(view).max(0.0) * (0.4 + 0.6 * seen.sky);
     let height = 0.5 + 0.5 * normal.dot(lights.up);
     let sky = SKY_BELOW.lerp(SKY_ABOVE, height) * bounced(seen.sky, albedo);
@@ -47,6 +48,13 @@ pub(super) fn clay(lights: &Lights, albedo: DVec3, normal: DVec3, view: DVec3, s
     let facing = normal.dot(view).clamp(0.0, 1.0);
     let rim = RIM * (normal.dot(lights.rim).max(0.0) * (1.0 - facing).powi(3) * 0.55 * seen.sky);
     diffuse + sheen + rim
+}
+
+/// What sculptors rub into and off a cast: a factor that darkens creases and lightens ridges by their mean curvature
+/// (1/voxel), so that both can be seen in full light as well. Half of its effect is reached at a radius of about 6 voxels.
+pub(super) fn patina(mean_curvature: f64) -> f64 {
+    let strength = (3.0 * mean_curvature.abs()).tanh();
+    if mean_curvature < 0.0 { 1.0 - 0.42 * strength } else { 1.0 + 0.14 * strength }
 }
 
 /// Light on a surface whose colour says something: bright and even, so that the colour can be read off a legend.
@@ -68,15 +76,17 @@ fn bounced(seen: f64, albedo: DVec3) -> DVec3 {
 /// Filmic tone curve, 0..∞ to 0..1 (Narkowicz's fit of ACES): soft shoulder, slight toe.
 pub(super) fn filmic(x: DVec3) -> DVec3 {
     let curve = |x: f64| (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14);
-    x.map(|c| curve(0.82 * c.max(0.0)).min(1.0))
+    x.map(|c| curve(0.86 * c.max(0.0)).min(1.0))
+}
+
+/// Linear from sRGB 0..1.
+pub(super) fn to_linear(srgb: DVec3) -> DVec3 {
+    srgb.map(|c| if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) })
 }
 
 /// Linear from 8-bit sRGB.
-pub(super) fn decode([r, g, b]: [u8; 3]) -> DVec3 {
-    DVec3::new(f64::from(r), f64::from(g), f64::from(b)).map(|c| {
-        let c = c / 255.0;
-        if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
-    })
+pub(super) fn decode(srgb: [u8; 3]) -> DVec3 {
+    to_linear(DVec3::from_array(srgb.map(f64::from)) / 255.0)
 }
 
 /// 8-bit sRGB from linear 0..1. `dither` (0..1) decides which of the two nearest values is taken: smooth gradients keep

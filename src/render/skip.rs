@@ -160,3 +160,35 @@ fn bare_faces(grid: &Grid) -> Vec<IVec3> {
     }
     out
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::testing::{scene, shape};
+
+    #[test]
+    fn empty_boxes_hold_no_change_of_sign_and_are_as_large_as_they_can_be() {
+        let set = shape(crate::grid::Transform::uniform(1.0), 3.0, 80, |p| {
+            (p.length() - 30.0).min((p - DVec3::new(60.0, -20.0, 33.0)).length() - 9.0)
+        });
+        let map = scene(&set).skip;
+        let blocks = |lo: IVec3, hi: IVec3| {
+            (lo.x..hi.x)
+                .flat_map(move |x| (lo.y..hi.y).flat_map(move |y| (lo.z..hi.z).map(move |z| IVec3::new(x, y, z))))
+        };
+        let changes = |block: IVec3| {
+            let mut signs = blocks(block * 8, block * 8 + 9).map(|v| set.grid().voxel(v).0 < 0.0);
+            let first = signs.next();
+            signs.any(|s| Some(s) != first)
+        };
+        let (lo, hi) = (map.lo, map.lo + map.size);
+        let with_surface: Vec<IVec3> = blocks(lo, hi).filter(|b| changes(*b)).collect();
+        assert!(with_surface.len() > 100);
+        for block in blocks(lo, hi) {
+            let truth = with_surface.iter().map(|s| (*s - block).abs().max_element()).min().unwrap_or(0);
+            let expected =
+                (truth > 0).then(|| ((block - (truth - 1)).as_dvec3() * 8.0, (block + truth).as_dvec3() * 8.0));
+            assert_eq!(map.empty_around(block), expected, "{block}");
+        }
+    }
+}

@@ -149,8 +149,8 @@ impl Picture<'_> {
         let world_normal = self.transform.direction_to_world(normal);
         let xyz = || self.transform.index_to_world(position);
         let albedo = match self.color_by {
-            ColorBy::Clay => shade::CLAY,
-            ColorBy::Normal => world_normal * 0.5 + 0.5,
+            ColorBy::Clay => shade::CLAY * shade::patina(jet.mean_curvature()),
+            ColorBy::Normal => shade::to_linear(world_normal * 0.5 + 0.5),
             ColorBy::Curvature => shade::diverging(jet.mean_curvature() / self.range.0),
             ColorBy::Difference(_) => readers.other.as_mut().map_or(shade::CLAY, |(sampler, transform, voxel)| {
                 let phi = f64::from(sampler.trilinear(transform.world_to_index(xyz())));
@@ -243,7 +243,7 @@ impl Picture<'_> {
     fn color(&self, hit: &Hit, seen: Visibility) -> DVec3 {
         match self.color_by {
             ColorBy::Clay => shade::filmic(shade::clay(&self.lights, hit.albedo, hit.normal, hit.view, seen)),
-            ColorBy::Normal => shade::decode(hit.albedo.to_array().map(|c| (c * 255.0) as u8)) * (0.4 + 0.6 * seen.sky),
+            ColorBy::Normal => hit.albedo * (0.4 + 0.6 * seen.sky),
             _ => shade::data(&self.lights, hit.albedo, hit.normal, hit.view, seen).min(DVec3::ONE),
         }
     }
