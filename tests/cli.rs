@@ -326,6 +326,27 @@ fn fog_and_points_are_refused_by_name() {
 }
 
 #[test]
+fn volumes_become_level_sets_at_a_value() {
+    for (file, voxel_size) in [("vdb/fog_sphere_v223.vdb", 0.2), ("vdb/box_active_tiles.vdb", 1.0)] {
+        let Some(path) = shared(file) else { continue };
+        let path = path.to_str().unwrap();
+        let desk = Desk::new();
+        let made = desk.done(&["convert", path, "-o", "out.vdb", "--iso", "0.5", "--check", "--json"]).json();
+        assert!((made["voxel_size"].as_f64().unwrap() - voxel_size).abs() < 1e-6);
+        assert_eq!(made["components_after"], 1);
+        if file.contains("box") {
+            // 100 voxels a side hold 1 and the ones beside them 0: the surface is halfway, its edges cut by the polygons.
+            assert!((made["volume_after"].as_f64().unwrap() / 1e6 - 1.0).abs() < 1e-3, "{made}");
+        }
+        let info = desk.done(&["info", "out.vdb", "--json"]).json();
+        let classes: Vec<&Value> = info["grids"].as_array().unwrap().iter().map(|grid| &grid["class"]).collect();
+        assert_eq!((classes.len(), classes[1]), (2, &Value::from("level set")), "{info}");
+        desk.run(&["convert", path, "-o", "x.vdb", "--iso", "-1"]).fails(3, &["larger value"]);
+        desk.run(&["convert", path, "-o", "x.vdb", "--iso", "7"]).fails(3, &["no surface"]);
+    }
+}
+
+#[test]
 fn impossible_sizes() {
     let desk = Desk::new();
     desk.cube("cube.obj", "1");

@@ -75,12 +75,13 @@ impl Output {
         input::is_pipe(&self.path)
     }
 
-    /// Writes a level set; the surface `iso` of it where a mesh is wanted. `from` is the grid that it was made from.
+    /// Writes a level set; the surface `iso` of it where a mesh is wanted. `from` is the file that it came from, and the grid whose
+    /// place it takes.
     pub fn write(
         &self,
         level_set: &LevelSet,
         iso: f32,
-        from: Option<(&Volume, usize)>,
+        from: Option<(&Volume, Option<usize>)>,
         context: &Context,
     ) -> Result<Written> {
         context.run.check("writing")?;

@@ -60,6 +60,14 @@ impl Volume {
         match self.0 {}
     }
 
+    pub fn read_iso_field(&self, _: Option<&str>, _: f32, _: &RunOptions) -> Result<LevelSet> {
+        match self.0 {}
+    }
+
+    pub fn has_level_set(&self, _: Choice) -> bool {
+        match self.0 {}
+    }
+
     pub fn warnings(&self) -> &[String] {
         match self.0 {}
     }
