@@ -74,7 +74,12 @@ impl Volume {
 }
 
 /// Refuses.
-pub fn write(path: &Path, _: &LevelSet, _: Option<(&Volume, usize)>, _: &VolumeOptions) -> Result<(u64, Vec<String>)> {
+pub fn write(
+    path: &Path,
+    _: &LevelSet,
+    _: Option<(&Volume, Option<usize>)>,
+    _: &VolumeOptions,
+) -> Result<(u64, Vec<String>)> {
     Err(EditError::output(path, ABSENT))
 }
 
