@@ -28,6 +28,7 @@ enum Kind {
 
 /// How a `.vdb` is written.
 #[derive(Clone, Debug, Default)]
+#[cfg_attr(not(feature = "openvdb"), allow(dead_code))] // nothing is written without OpenVDB
 pub struct VolumeOptions {
     /// `--precision`: whether half; `None` keeps that of the input.
     pub half: Option<bool>,
