@@ -13,8 +13,8 @@ use super::input::{self, InputOptions};
 use super::output::{Output, Written};
 use super::preview::Preview;
 use super::{Verb, args, options};
-use crate::error::{EditError, Result};
-use crate::mesh::MeshFormat;
+use crate::error::Result;
+use crate::mesh::{MeshFormat, Rebuild, rebuild};
 use crate::ops::{Summary, WorldLength};
 
 /// The command.
@@ -49,26 +49,39 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let output = Output::plan(matches, context)?;
     let preview = Preview::plan(matches)?;
     let iso = matches.get_one::<Value>("iso").cloned();
-    if iso.is_some() && !output.is_mesh() {
-        let accepted = "an output that is a mesh; `offset` moves the surface of a level set";
-        return Err(EditError::parameter("convert", "iso", output.path.display(), accepted));
-    }
     if args::flag(matches, "dry-run") {
-        let lines = input::probe(&paths, &input_options)?;
+        let lines = match input::probe(&paths, &input_options) {
+            // A volume that is no level set is what --iso is for.
+            Err(_) if iso.is_some() && path.exists() => vec![format!("{}: a volume", path.display())],
+            lines => lines?,
+        };
         return edit::dry_run("convert", Map::new(), &lines, &output, context);
     }
     if MeshFormat::of(path).is_some() && output.is_mesh() && !input_options.has_size() && iso.is_none() {
         return mesh_to_mesh(path, &output, began, context);
     }
     let mut warnings = Vec::new();
-    let inputs = input::load(&paths, &input_options, &mut warnings, context)?;
-    let Some(level_set) = inputs.first().map(|input| input.level_set.clone()) else { return Ok(()) };
-    let iso = match iso.map(serde_json::from_value::<WorldLength>) {
-        Some(Ok(length)) => length.world(level_set.voxel_size()) as f32,
+    let of_volume = match iso.as_ref().and_then(Value::as_f64) {
+        Some(iso) => input::load_iso(path, &input_options, iso as f32, &mut warnings, context)?,
+        None => None,
+    };
+    let is_volume = of_volume.is_some();
+    let inputs = match of_volume {
+        Some(input) => vec![input],
+        None => input::load(&paths, &input_options, &mut warnings, context)?,
+    };
+    let Some(mut level_set) = inputs.first().map(|input| input.level_set.clone()) else { return Ok(()) };
+    let mut at = match iso.map(serde_json::from_value::<WorldLength>) {
+        Some(Ok(length)) if !is_volume => length.world(level_set.voxel_size()) as f32,
         _ => 0.0,
     };
+    if at != 0.0 && !output.is_mesh() {
+        let what = Rebuild { iso: at, ..Rebuild::band(level_set.half_width()) };
+        level_set = rebuild(&level_set, &what, &context.run)?;
+        at = 0.0;
+    }
     let summary = Summary { warnings, ..Summary::default() };
-    let edit = Edit { operation: "convert", inputs, level_set, summary, iso, began };
+    let edit = Edit { operation: "convert", inputs, level_set, summary, iso: at, began };
     edit.finish(&output, &preview, args::flag(matches, "check"), context)
 }
 

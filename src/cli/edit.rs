@@ -80,7 +80,7 @@ impl Edit {
     /// What the result is compared with: the first input, but for a conversion only if it was a level set already.
     fn before(&self) -> Option<&LevelSet> {
         let input = self.inputs.first()?;
-        (self.converts_nothing() || input.source.is_some()).then_some(&input.level_set)
+        (self.converts_nothing() || input.from().is_some_and(|(_, index)| index.is_some())).then_some(&input.level_set)
     }
 
     fn converts_nothing(&self) -> bool {

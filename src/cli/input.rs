@@ -52,13 +52,13 @@ pub struct Input {
     pub path: PathBuf,
     /// The level set, valid.
     pub level_set: LevelSet,
-    /// Where it was, if in a `.vdb`.
-    pub source: Option<(Volume, usize)>,
+    /// The `.vdb` that it came from, and its place there if it was a grid of its own.
+    pub source: Option<(Volume, Option<usize>)>,
 }
 
 impl Input {
-    /// The grid to be replaced by a result of this input.
-    pub fn from(&self) -> Option<(&Volume, usize)> {
+    /// The file to be carried over by a result of this input, and the grid to be replaced by it.
+    pub fn from(&self) -> Option<(&Volume, Option<usize>)> {
         self.source.as_ref().map(|(volume, index)| (volume, *index))
     }
 }
@@ -155,7 +155,7 @@ fn mesh_format(path: &Path) -> Result<MeshFormat> {
 
 /// A file read, not yet a level set where it is a mesh.
 enum Raw {
-    Volume(Volume, VolumeGrid),
+    Volume(Box<(Volume, VolumeGrid)>),
     Mesh(TriangleMesh),
 }
 
@@ -184,7 +184,7 @@ pub fn load(
             warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
             let grid = volume.read(options.choice(volumes))?;
             volumes += 1;
-            raw.push(Raw::Volume(volume, grid));
+            raw.push(Raw::Volume(Box::new((volume, grid))));
         } else {
             raw.push(Raw::Mesh(read_mesh(path, warnings)?));
         }
@@ -193,9 +193,10 @@ pub fn load(
     let mut inputs = Vec::new();
     for (path, raw) in paths.iter().zip(raw) {
         let (level_set, source) = match raw {
-            Raw::Volume(volume, grid) => {
+            Raw::Volume(read) => {
+                let (volume, grid) = *read;
                 let index = grid.index;
-                (valid(path, grid, options, warnings, context)?, Some((volume, index)))
+                (valid(path, grid, options, warnings, context)?, Some((volume, Some(index))))
             }
             Raw::Mesh(mesh) => (convert(path, &mesh, &conversion, warnings, context)?, None),
         };
@@ -207,8 +208,35 @@ pub fn load(
     Ok(inputs)
 }
 
+/// The level set of the surface of a scalar volume at `iso`; `None` if the file holds a level set, or is none of volumes.
+pub fn load_iso(
+    path: &Path,
+    options: &InputOptions,
+    iso: f32,
+    warnings: &mut Vec<String>,
+    context: &Context,
+) -> Result<Option<Input>> {
+    if !is_volume(path) || is_pipe(path) {
+        return Ok(None);
+    }
+    let choice = options.choice(0);
+    let volume = volume::open(path, &context.run)?;
+    if volume.has_level_set(choice) {
+        return Ok(None);
+    }
+    warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
+    let field = volume.read_iso_field(choice.grid, iso, &context.run)?;
+    let half_width = options.half_width.map_or(DEFAULT_HALF_WIDTH, |w| w.voxels(field.voxel_size()) as f32);
+    let level_set = rebuild(&field, &Rebuild::band(half_width), &context.run)?;
+    if level_set.is_empty() {
+        return Err(EditError::input(path, format!("no voxel holds more than {iso}: there is no surface")));
+    }
+    Ok(Some(Input { path: path.to_path_buf(), level_set, source: Some((volume, None)) }))
+}
+
 /// Reads a mesh file.
 pub fn read_mesh(path: &Path, warnings: &mut Vec<String>) -> Result<TriangleMesh> {
+    mesh_format(path)?;
     let read = mesh::read(path)?;
     warnings.extend(read.warnings.into_iter().map(|w| format!("{}: {w}", path.display())));
     Ok(read.mesh)
@@ -216,7 +244,7 @@ pub fn read_mesh(path: &Path, warnings: &mut Vec<String>) -> Result<TriangleMesh
 
 fn conversion_of(raw: &[Raw], options: &InputOptions) -> Result<MeshToLevelSet> {
     let volume = raw.iter().find_map(|raw| match raw {
-        Raw::Volume(_, grid) => Some(&grid.level_set),
+        Raw::Volume(read) => Some(&read.1.level_set),
         Raw::Mesh(_) => None,
     });
     let boxes = raw.iter().filter_map(|raw| match raw {

@@ -28,6 +28,7 @@ enum Kind {
 
 /// How a `.vdb` is written.
 #[derive(Clone, Debug, Default)]
+#[cfg_attr(not(feature = "openvdb"), allow(dead_code))] // nothing is written without OpenVDB
 pub struct VolumeOptions {
     /// `--precision`: whether half; `None` keeps that of the input.
     pub half: Option<bool>,
@@ -75,12 +76,13 @@ impl Output {
         input::is_pipe(&self.path)
     }
 
-    /// Writes a level set; the surface `iso` of it where a mesh is wanted. `from` is the grid that it was made from.
+    /// Writes a level set; the surface `iso` of it where a mesh is wanted. `from` is the file that it came from, and the grid whose
+    /// place it takes.
     pub fn write(
         &self,
         level_set: &LevelSet,
         iso: f32,
-        from: Option<(&Volume, usize)>,
+        from: Option<(&Volume, Option<usize>)>,
         context: &Context,
     ) -> Result<Written> {
         context.run.check("writing")?;

@@ -77,6 +77,16 @@ impl Volume {
         Ok(VolumeGrid { level_set: read.level_set, index: read.index, selector, band })
     }
 
+    /// The field whose zero set is the surface of a scalar volume at a value; its level set is still to be made.
+    pub fn read_iso_field(&self, grid: Option<&str>, iso: f32, run: &RunOptions) -> Result<LevelSet> {
+        self.file.read_iso_field(self.file.select_scalar(grid)?, iso, run)
+    }
+
+    /// Whether the chosen grid is a level set, or the only grid that could be one.
+    pub fn has_level_set(&self, choice: Choice) -> bool {
+        self.file.select_level_set(choice.grid, choice.assume_level_set).is_ok()
+    }
+
     /// What OpenVDB had to say while reading.
     pub fn warnings(&self) -> &[String] {
         &self.file.listing().warnings
@@ -105,12 +115,12 @@ fn band_state(read: &ReadLevelSet) -> BandState {
     }
 }
 
-/// Writes a level set, in the place of the one that it was made from and with all else that was beside it. Returns the
-/// size of the file and what is not as asked.
+/// Writes a level set with all else that is in the file that it came from, in the place of the grid that it was made
+/// from or after all others. Returns the size of the file and what is not as asked.
 pub fn write(
     path: &Path,
     level_set: &LevelSet,
-    from: Option<(&Volume, usize)>,
+    from: Option<(&Volume, Option<usize>)>,
     options: &VolumeOptions,
 ) -> Result<(u64, Vec<String>)> {
     let options = WriteOptions {
@@ -122,9 +132,9 @@ pub fn write(
         }),
         only_result: options.only_result,
     };
-    let (file, index) = from.unzip();
-    let grid = GridToWrite { level_set, name: from.is_none().then_some(NEW_NAME), replaces: index };
-    let report = crate::vdb::write(path, &[grid], file.map(|volume| &volume.file), &options)?;
+    let index = from.and_then(|(_, index)| index);
+    let grid = GridToWrite { level_set, name: index.is_none().then_some(NEW_NAME), replaces: index };
+    let report = crate::vdb::write(path, &[grid], from.map(|(volume, _)| &volume.file), &options)?;
     Ok((report.bytes, report.warnings))
 }
 

@@ -60,13 +60,26 @@ impl Volume {
         match self.0 {}
     }
 
+    pub fn read_iso_field(&self, _: Option<&str>, _: f32, _: &RunOptions) -> Result<LevelSet> {
+        match self.0 {}
+    }
+
+    pub fn has_level_set(&self, _: Choice) -> bool {
+        match self.0 {}
+    }
+
     pub fn warnings(&self) -> &[String] {
         match self.0 {}
     }
 }
 
 /// Refuses.
-pub fn write(path: &Path, _: &LevelSet, _: Option<(&Volume, usize)>, _: &VolumeOptions) -> Result<(u64, Vec<String>)> {
+pub fn write(
+    path: &Path,
+    _: &LevelSet,
+    _: Option<(&Volume, Option<usize>)>,
+    _: &VolumeOptions,
+) -> Result<(u64, Vec<String>)> {
     Err(EditError::output(path, ABSENT))
 }
 

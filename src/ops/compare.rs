@@ -268,7 +268,8 @@ mod tests {
         assert!(found.resampled && !found.identical);
         // Polygons lie within κ h²/8 a direction of the sphere: 1/80 voxel each at a radius of ten.
         assert!(found.max_diff_voxels < 0.04, "{}", found.max_diff_voxels);
-        assert!(found.surface_distance.unwrap().max < 0.03);
+        // Vertices lie within κ h²/8 of the sphere, and triangles with edges of √3 voxels within three times that.
+        assert!(found.surface_distance.unwrap().max < 0.05);
     }
 
     #[test]

@@ -8,6 +8,8 @@ use glam::DVec3;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 
+use crate::error::EditError;
+
 /// A number with an optional unit: `3vx` is voxels, `0.5wu` world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Quantity {
@@ -161,6 +163,20 @@ enum NumberOrText {
     Number(f64),
     Text(String),
 }
+
+/// The voxel size in world units, or why it cannot be one: positive, finite and not itself in voxels.
+pub(crate) fn voxel_size(operation: &str, size: WorldLength) -> Result<f64, EditError> {
+    // Asked in a world whose voxels have no size, a length in voxels is no number.
+    let world = size.world(f64::NAN);
+    if VOXEL_SIZES.contains(&world) {
+        return Ok(world);
+    }
+    let accepted = format!("a size in world units between {:e} and {:e}", VOXEL_SIZES.start(), VOXEL_SIZES.end());
+    Err(EditError::parameter(operation, "voxel_size", size, accepted))
+}
+
+/// Voxel sizes whose squares and products stay within f32 in every kernel.
+const VOXEL_SIZES: std::ops::RangeInclusive<f64> = 1e-9..=1e9;
 
 /// Comma-separated numbers.
 pub(crate) fn parse_numbers(text: &str) -> Result<Vec<f64>, String> {

@@ -15,6 +15,7 @@ mod bridge;
 mod listing;
 mod read;
 pub mod reference;
+mod scalar;
 mod select;
 mod structure;
 mod write;

@@ -32,7 +32,7 @@ pub fn list(path: impl AsRef<Path>) -> Result<FileListing> {
 pub struct VdbFile {
     pub(super) archive: UniquePtr<ffi::Archive>,
     listing: FileListing,
-    path: std::path::PathBuf,
+    pub(super) path: std::path::PathBuf,
 }
 
 /// A level set as it was read.
