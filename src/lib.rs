@@ -8,7 +8,7 @@
 //! use vdb_edit::mesh::{self, level_set_to_mesh};
 //! use vdb_edit::ops::shape::Shape;
 //! use vdb_edit::ops::smooth::{Smooth, smooth};
-//! use vdb_edit::ops::{EvolutionOptions, Operator, RegionSpecs};
+//! use vdb_edit::ops::{EvolutionOptions, Operator, RegionSpecs, WorldLength};
 //! use vdb_edit::run::RunOptions;
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -17,7 +17,7 @@
 //! let run = RunOptions::default();
 //!
 //! // A bar of 40 × 20 × 20 voxels; lengths are in world units.
-//! let bar = Shape { spec: "box size=2,1,1".into(), voxel_size: Some(0.05), ..Shape::default() };
+//! let bar = Shape { spec: "box size=2,1,1".into(), voxel_size: Some(WorldLength::new(0.05)), ..Shape::default() };
 //! let mut level_set = bar.apply(vec![], &run)?.level_set;
 //! let before = level_set.measure(&run)?;
 //!
