@@ -2,7 +2,7 @@
 //!
 //! With unscaled central differences Dx = (φ₊ − φ₋)/2, Dxx = φ₊ − 2φ + φ₋, Dxy = (φ₊₊ − φ₊₋ − φ₋₊ + φ₋₋)/4,
 //!
-//! > 2H |Dφ|³ = Σ Dx²(Dyy + Dzz) − 2 Σ Dx Dy Dxy   (sums over the cyclic permutations; MATH 3.2)
+//! > 2H |Dφ|³ = Σ Dx²(Dyy + Dzz) − 2 Σ Dx Dy Dxy   (sums over the cyclic permutations)
 //!
 //! H = (κ₁ + κ₂)/2 = div(∇φ/|∇φ|)/2 is positive on convex parts (φ negative inside). Where the gradient vanishes
 //! (the medial axis, flat parts beyond the band) the curvature is taken as 0.
