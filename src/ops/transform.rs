@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::params::{Vector, parse_numbers};
 use super::registry::{Arity, Operator, Outcome};
 use crate::error::{EditError, Result};
-use crate::grid::Transform;
+use crate::grid::{Transform, VOXEL_SIZES};
 use crate::levelset::LevelSet;
 use crate::mesh::onto_lattice;
 use crate::run::RunOptions;
@@ -99,8 +99,9 @@ impl Operator for TransformOperator {
                     "without `keep_grid`, which resamples nothing",
                 ));
             }
-            if !(size > 0.0 && size.is_finite()) {
-                return Err(EditError::parameter(Self::NAME, "voxel_size", size, "a positive number of world units"));
+            if !VOXEL_SIZES.contains(&size) {
+                let accepted = format!("{:e} to {:e} world units", VOXEL_SIZES.start(), VOXEL_SIZES.end());
+                return Err(EditError::parameter(Self::NAME, "voxel_size", size, accepted));
             }
         }
         Ok(())
