@@ -76,6 +76,22 @@ impl LeafMask {
         (self.0[x] >> (y * 8)) as u8
     }
 
+    /// Calls `f` with x, y and the 16 bits of every pair of rows (x, y), (x, y + 1) that has an active voxel; y is even.
+    #[inline(always)]
+    pub fn for_each_pair(&self, mut f: impl FnMut(usize, usize, u16)) {
+        for (x, &word) in self.0.iter().enumerate() {
+            if word == 0 {
+                continue;
+            }
+            for pair in 0..4 {
+                let bits = (word >> (16 * pair)) as u16;
+                if bits != 0 {
+                    f(x, 2 * pair, bits);
+                }
+            }
+        }
+    }
+
     /// Offsets of the active voxels in ascending order.
     pub fn iter(self) -> impl Iterator<Item = usize> {
         self.0.into_iter().enumerate().flat_map(|(x, word)| {

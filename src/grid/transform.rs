@@ -8,7 +8,7 @@ const UNIFORM_TOLERANCE: f64 = 1e-7;
 
 /// Edges of a voxel, in world units, between which the products of distances in f32 neither vanish nor overflow (WENO5 and the
 /// curvature go up to the fourth power of a distance times small numbers).
-pub const VOXEL_SIZES: std::ops::RangeInclusive<f64> = 1e-8..=1e8;
+pub const VOXEL_SIZES: std::ops::RangeInclusive<f64> = 1e-9..=1e9;
 
 /// The placement of a grid in the world: `xyz = linear · ijk + translation`, voxels cubic with edge [`voxel_size`](Self::voxel_size).
 ///

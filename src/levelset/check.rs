@@ -8,12 +8,14 @@
 //!
 //! One pass over the leaves, in parallel; counts and examples do not depend on the number of threads.
 
+use fearless_simd::{Simd, SimdBase};
 use glam::IVec3;
 use rayon::prelude::*;
 
 use super::LevelSet;
 use super::violation::{FLATTEST, STEEPEST, Violation, ViolationKind};
-use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, neighbour_index, offset_to_local};
+use crate::grid::{Face, Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, neighbour_index, offset_to_local};
+use crate::stencil::simd::{Work, dispatch};
 use crate::stencil::upwind::godunov_first;
 use crate::stencil::{Halo, Row};
 
@@ -117,8 +119,8 @@ impl LeafCheck<'_> {
     fn run(mut self) {
         self.voxels();
         let around = &self.grid.neighbours()[self.id.index()];
-        let mut halo = Halo::<10>::new();
-        halo.gather_star(self.grid.value_pages(), around);
+        let mut halo = Halo::new();
+        halo.gather(self.grid.value_pages(), around);
         for (f, face) in Face::ALL.into_iter().enumerate() {
             let beyond = around[neighbour_index(face.step())];
             // Each pair belongs to its lower voxel's leaf, or to the upper one's where the lower leaf is absent.
@@ -160,7 +162,7 @@ impl LeafCheck<'_> {
 
     /// Checks the pairs across `face`: all of the leaf on an upper side, only those with the absent leaf on a lower
     /// side.
-    fn pairs(&mut self, halo: &Halo<10>, face: Face, beyond: LeafId) {
+    fn pairs(&mut self, halo: &Halo, face: Face, beyond: LeafId) {
         let mask = self.grid.mask(self.id);
         let other = self.grid.mask(beyond);
         let [dx, dy, dz] = face.step().to_array().map(|d| d as isize);
@@ -223,7 +225,7 @@ impl LeafCheck<'_> {
 
     /// Checks |∇φ| on the steeper side of each crossed edge within the leaf. Edges between leaves are left out: no
     /// leaf has the gradient on both sides, and the inner ones are enough to judge the field.
-    fn flatness(&mut self, halo: &Halo<10>) {
+    fn flatness(&mut self, halo: &Halo) {
         let mask = self.grid.mask(self.id);
         let values = &self.grid.values(self.id).0;
         let inside = LeafMask(std::array::from_fn(|x| {
@@ -236,13 +238,9 @@ impl LeafCheck<'_> {
         if crossed.is_empty() {
             return;
         }
-        let mut squared = [[[0.0; 8]; 8]; 8];
-        for (x, slice) in squared.iter_mut().enumerate() {
-            for (y, row) in slice.iter_mut().enumerate().filter(|(y, _)| crossed.row(x, *y) != 0) {
-                *row = godunov_first(halo, x, y);
-            }
-        }
-        let at = |p: IVec3| squared[p.x as usize][p.y as usize][p.z as usize];
+        let mut squared = [0.0; LEAF_VOXELS];
+        dispatch(SquaredGradients { halo, rows: crossed, squared: &mut squared });
+        let at = |p: IVec3| squared[crate::grid::leaf_offset(p)];
         for offset in crossed_inside.zip(mask, |s, a| s & a).iter() {
             let voxel = offset_to_local(offset);
             for face in Face::ALL {
@@ -258,6 +256,23 @@ impl LeafCheck<'_> {
                 }
             }
         }
+    }
+}
+
+/// Godunov's |Dφ|² of the pairs of rows that have a bit in `rows`.
+struct SquaredGradients<'a> {
+    halo: &'a Halo,
+    rows: LeafMask,
+    squared: &'a mut [f32; LEAF_VOXELS],
+}
+
+impl Work for SquaredGradients<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        self.rows.for_each_pair(|x, y, _| {
+            let at = x * 64 + y * 8;
+            godunov_first(simd, self.halo, x, y).store_slice(&mut self.squared[at..at + 16]);
+        });
     }
 }
 

@@ -89,7 +89,7 @@ struct Sums {
 }
 
 fn leaf_sums(grid: &Grid, surface: &IsoSurface, leaf: &SurfaceLeaf) -> Sums {
-    let mut halo = Halo::<10>::new();
+    let mut halo = Halo::new();
     halo.gather(grid.value_pages(), &grid.neighbours()[leaf.id.index()]);
     let mut sums = Sums::default();
     surface.rows(leaf).for_each_cell(|cell, pattern| {
@@ -142,7 +142,7 @@ struct Points {
 impl Points {
     /// The cell with the given first corner, −1..8 along each axis.
     #[inline(always)]
-    fn new(halo: &Halo<10>, cell: IVec3) -> Self {
+    fn new(halo: &Halo, cell: IVec3) -> Self {
         let values = std::array::from_fn(|c| halo.value(cell + corner(c)));
         Self { cell: cell.as_dvec3(), values }
     }

@@ -1,7 +1,7 @@
 //! A tree of boxes over triangles: closest points, and the groups for winding numbers.
 //!
-//! The tree is built by `obvhs` (PLOC) over boxes in f32, rounded outwards so that they hold the f64 triangles; everything
-//! computed on it is f64.
+//! The tree is built by `obvhs` (PLOC) over boxes in f32 about the middle of all, rounded outwards so that they hold the f64
+//! triangles; everything computed on it is f64.
 
 use glam::{DVec3, Vec3A};
 use obvhs::aabb::Aabb;
@@ -36,19 +36,24 @@ pub struct Hit {
 /// Triangles in a tree of boxes.
 pub struct Bvh {
     tree: Bvh2,
+    /// What the boxes are relative to.
+    middle: DVec3,
     /// In the order of the tree's leaves.
     triangles: Vec<[DVec3; 3]>,
 }
 
 impl Bvh {
-    /// Builds the tree. Coordinates must be finite, and small enough for f32.
+    /// Builds the tree. Coordinates must be finite, and their extent within the range of f32.
     pub fn new(triangles: Vec<[DVec3; 3]>) -> Self {
+        let corners = || triangles.iter().flatten();
+        let lo = corners().fold(DVec3::INFINITY, |lo, c| lo.min(*c));
+        let hi = corners().fold(DVec3::NEG_INFINITY, |hi, c| hi.max(*c));
+        let middle = if triangles.is_empty() { DVec3::ZERO } else { lo + (hi - lo) * 0.5 };
         let boxes: Vec<Aabb> = triangles
             .iter()
             .map(|[a, b, c]| {
-                let (lo, hi) = (a.min(*b).min(*c), a.max(*b).max(*c));
-                let down = lo.to_array().map(|v| (v as f32).next_down());
-                let up = hi.to_array().map(|v| (v as f32).next_up());
+                let down = (a.min(*b).min(*c) - middle).to_array().map(|v| (v as f32).next_down());
+                let up = (a.max(*b).max(*c) - middle).to_array().map(|v| (v as f32).next_up());
                 Aabb::new(Vec3A::from_array(down), Vec3A::from_array(up))
             })
             .collect();
@@ -57,7 +62,7 @@ impl Bvh {
         collapse(&mut tree, LEAF_TRIANGLES, 2.0);
         tree.reorder_in_stack_traversal_order();
         let triangles = tree.primitive_indices.iter().map(|&t| triangles[t as usize]).collect();
-        Self { tree, triangles }
+        Self { tree, middle, triangles }
     }
 
     /// Number of nodes; 0 without triangles.
@@ -80,12 +85,26 @@ impl Bvh {
     /// The box of `node`.
     pub(crate) fn node_box(&self, node: usize) -> (DVec3, DVec3) {
         let aabb = self.tree.nodes[node].aabb();
-        (aabb.min.as_dvec3(), aabb.max.as_dvec3())
+        (aabb.min.as_dvec3() + self.middle, aabb.max.as_dvec3() + self.middle)
     }
 
-    /// The triangles as given, in an order in which neighbours are near each other.
-    pub(crate) fn order(&self) -> &[u32] {
-        &self.tree.primitive_indices
+    /// The triangles as given, in an order in which neighbours are near each other: that of a walk through the tree.
+    pub(crate) fn order(&self) -> Vec<u32> {
+        let mut order = Vec::with_capacity(self.triangles.len());
+        let mut stack = Vec::new();
+        if self.node_count() > 0 {
+            stack.push(0);
+        }
+        while let Some(node) = stack.pop() {
+            match self.children(node) {
+                Children::Nodes(pair) => stack.extend(pair),
+                Children::Triangles(list) => {
+                    let first = self.tree.nodes[node].first_index as usize;
+                    order.extend_from_slice(&self.tree.primitive_indices[first..first + list.len()]);
+                }
+            }
+        }
+        order
     }
 
     /// Whether `f` holds for any triangle whose leaf touches the box.
@@ -179,12 +198,14 @@ mod tests {
 
     #[test]
     fn the_nearest_point_of_a_fine_sphere_is_on_the_ray() {
-        let mesh = sphere(DVec3::new(40.0, -7.0, 3.0), 10.0, 100);
+        // Far away, where the boxes would not tell the triangles apart if they were not relative to the middle.
+        let center = DVec3::new(4e8, -7.0, 3.0);
+        let mesh = sphere(center, 10.0, 100);
         let bvh = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect());
         for i in 0..200 {
-            let p = DVec3::new(40.0, -7.0, 3.0) + 40.0 * (DVec3::new(noise(i), noise(i + 1000), noise(i + 2000)) - 0.5);
+            let p = center + 40.0 * (DVec3::new(noise(i), noise(i + 1000), noise(i + 2000)) - 0.5);
             let hit = bvh.closest_point(p, f64::INFINITY).unwrap();
-            let truth = ((p - DVec3::new(40.0, -7.0, 3.0)).length() - 10.0).abs();
+            let truth = ((p - center).length() - 10.0).abs();
             // The chord of a facet of edge 2πr/200 falls short of the sphere by r(1 − cos(π/200)), twice for the diagonal.
             assert!((hit.distance_squared.sqrt() - truth).abs() < 0.003, "{hit:?} {truth}");
         }

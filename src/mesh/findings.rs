@@ -55,12 +55,13 @@ impl MeshFindings {
                 out.push(sentence);
             }
         };
+        let closing = match self.closure_triangles {
+            0 => "the other parts cover its openings".into(),
+            n => format!("closed by {n} triangles where its winding number is 1/2"),
+        };
         say(
             converted.boundary_edges > 0,
-            format!(
-                "the mesh is open ({} boundary edges): closed where its winding number is 1/2, with {} triangles",
-                converted.boundary_edges, self.closure_triangles
-            ),
+            format!("the mesh is open ({} boundary edges): {closing}", converted.boundary_edges),
         );
         say(
             converted.boundary_edges == 0 && self.closure_triangles > 0,

@@ -8,11 +8,12 @@
 use std::collections::VecDeque;
 
 use glam::DVec3;
+use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::topology::{DisjointSets, EdgeUse, by_edge, edge_uses, is_degenerate, sorted, volume_about};
 use super::winding::solid_angle;
-use super::{MeshFindings, TriangleMesh, analyze};
+use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber, analyze};
 
 /// How near two vertices on open edges must be to be joined, relative to the diagonal of the bounding box. Exporters
 /// that write f32 move a corner by 1e-7 of the coordinates; real gaps of models are above 1e-4.
@@ -45,7 +46,7 @@ pub fn prepare(mesh: &TriangleMesh) -> (TriangleMesh, MeshFindings) {
 }
 
 /// Lets every triangle use the first of the vertices that have equal coordinates. Returns how many vertices were joined.
-pub fn weld_equal(mesh: &mut TriangleMesh) -> usize {
+fn weld_equal(mesh: &mut TriangleMesh) -> usize {
     let mut first: FxHashMap<[u64; 3], u32> = FxHashMap::default();
     first.reserve(mesh.positions.len());
     let mut joined = 0;
@@ -219,8 +220,8 @@ impl Patches {
     }
 }
 
-/// Turns outwards what encloses a negative volume: all of the mesh, its open pieces together, its closed parts one by one
-/// unless they are cavities.
+/// Turns outwards what faces inwards: all closed parts if their volume is negative, all open pieces together by their winding
+/// numbers, and single closed parts unless they are cavities.
 fn orient_outwards(mesh: &mut TriangleMesh, patches: &Patches, findings: &mut MeshFindings) {
     let Some((lo, hi)) = mesh.bounding_box() else { return };
     let middle = lo + (hi - lo) * 0.5;
@@ -230,18 +231,18 @@ fn orient_outwards(mesh: &mut TriangleMesh, patches: &Patches, findings: &mut Me
     }
     let ids = 0..patches.closed.len() as u32;
     let is_closed = |p: &u32| patches.closed[*p as usize];
-    let total: f64 = volumes.iter().sum();
-    // A patch between non-manifold edges is part of a shell whose other parts it must agree with, so all such turn together.
-    let loose: f64 = ids.clone().filter(|p| !is_closed(p)).map(|p| volumes[p as usize]).sum();
     let mut turned: FxHashSet<u32> = FxHashSet::default();
-    if total < 0.0 {
+    if ids.clone().filter(is_closed).map(|p| volumes[p as usize]).sum::<f64>() < 0.0 {
         findings.inside_out = true;
-        turned.extend(ids.clone());
+        turned.extend(ids.clone().filter(is_closed));
         volumes.iter_mut().for_each(|v| *v = -*v);
-    } else if loose < 0.0 && loose.abs() > 1e-3 * total {
-        // Weighed against the closed parts, so that a flat scrap beside a solid does not decide by its noise.
+    }
+    // A patch between non-manifold edges is part of a shell whose other parts it must agree with, so all such turn together.
+    let loose: Vec<u32> = ids.clone().filter(|p| !is_closed(p)).collect();
+    let volume = loose.iter().map(|&p| volumes[p as usize]).sum();
+    if !loose.is_empty() && faces_inwards(mesh, patches, volume) {
         findings.inside_out = true;
-        turned.extend(ids.clone().filter(|p| !is_closed(p)));
+        turned.extend(loose);
     }
 
     let inward: Vec<u32> = ids.filter(|p| is_closed(p) && volumes[*p as usize] < 0.0).collect();
@@ -259,6 +260,40 @@ fn orient_outwards(mesh: &mut TriangleMesh, patches: &Patches, findings: &mut Me
         }
     }
     patches.turn(mesh, &turned);
+}
+
+/// Whether the open patches face inwards, given their signed `volume` about the middle of the mesh.
+///
+/// Where that is small for their area they are far from closed and it depends on the origin. Then the mean winding
+/// number on them decides, which is ½ on a closed surface and −½ on one that is inside out.
+fn faces_inwards(mesh: &TriangleMesh, patches: &Patches, volume: f64) -> bool {
+    /// The least volume to trust, relative to that of a sphere of the same area: the bunny with its holes has 0.58. Below
+    /// that both answers cost, so ask the better one.
+    const BULKY: f64 = 0.5;
+    /// As many triangles are asked, evenly chosen.
+    const SAMPLES: usize = 4096;
+    /// The box is scaled to this, the size of a grid, for which the tree's tolerances are made.
+    const EXTENT: f64 = 512.0;
+    let Some((lo, hi)) = mesh.bounding_box() else { return false };
+    let scale = EXTENT / (hi - lo).max_element().max(f64::MIN_POSITIVE);
+    let open = (0..mesh.triangles.len()).filter(|&t| !patches.closed[patches.of[t] as usize]);
+    let triangles: Vec<[DVec3; 3]> = open.map(|t| mesh.corners(t).map(|c| (c - lo) * scale)).collect();
+    let area: f64 = triangles.iter().map(|[a, b, c]| 0.5 * (b - a).cross(c - a).length()).sum();
+    let sphere = area.powf(1.5) / (6.0 * std::f64::consts::PI.sqrt());
+    if volume.abs() * scale.powi(3) > BULKY * sphere {
+        return volume < 0.0;
+    }
+    let bvh = Bvh::new(triangles.clone());
+    let winding = WindingNumber::new(&bvh);
+    let stride = triangles.len().div_ceil(SAMPLES).max(1);
+    let facing = triangles.par_iter().step_by(stride).map(|&[a, b, c]| {
+        let normal = (b - a).cross(c - a);
+        // In front of the triangle w is ½ less than on it.
+        let front = winding.at((a + b + c) / 3.0 + normal.normalize_or_zero() * 1e-3);
+        normal.length() * (front + 0.5)
+    });
+    // Collected first: the sum of a parallel iterator depends on how it was split.
+    facing.collect::<Vec<f64>>().iter().sum::<f64>() < 0.0
 }
 
 /// The closed patches with their triangles and boxes, to find out which lies within which.

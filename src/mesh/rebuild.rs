@@ -44,7 +44,7 @@ pub fn rebuild(level_set: &LevelSet, what: &Rebuild, run: &RunOptions) -> Result
     let transform = *level_set.transform();
     let voxel_size = transform.voxel_size();
     let Rebuild { half_width, iso, offset } = *what;
-    if !(iso.abs() < level_set.background()) {
+    if iso.is_nan() || iso.abs() >= level_set.background() {
         return Err(EditError::parameter(
             OPERATION,
             "iso",

@@ -13,9 +13,9 @@
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 
-use super::closest::closest_on_triangle;
 use crate::error::Result;
 use crate::grid::{LEAF_VOXELS, LeafValues};
+use crate::mesh::closest::closest_on_triangle;
 use crate::run::RunOptions;
 
 /// Leaves along a tile's edge: a tile's 128 KiB of values stay in the second-level cache while its triangles pass.

@@ -46,7 +46,7 @@ impl Operator for RebuildDistance {
     }
 }
 
-/// Restore |∇φ| = 1 step by step, from the surface outwards, without changing the band.
+/// Restore |∇φ| = 1 step by step, from the surface outwards; the band is trimmed, never widened.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Renormalize {
@@ -89,7 +89,10 @@ impl Operator for Renormalize {
             normalizations: self.iterations,
             weno_epsilon: WenoEpsilon::SCALE_FREE,
         };
-        pde::renormalize(&mut level_set, &solver, run)?;
+        let mut tracker = pde::Tracker::new(&mut level_set, None, solver, run);
+        tracker.renormalize()?;
+        // Voxels at the rim may have been found to lie beyond it.
+        tracker.trim_band();
         Ok(Outcome { level_set, summary: Summary { steps: Some(self.iterations), ..Summary::default() } })
     }
 }

@@ -8,6 +8,9 @@ use glam::DVec3;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 
+use crate::error::EditError;
+use crate::grid::VOXEL_SIZES;
+
 /// A number with an optional unit: `3vx` is voxels, `0.5wu` world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Quantity {
@@ -160,6 +163,17 @@ length!(
 enum NumberOrText {
     Number(f64),
     Text(String),
+}
+
+/// The voxel size in world units, or why it cannot be one: positive, finite and not itself in voxels.
+pub(crate) fn voxel_size(operation: &str, size: WorldLength) -> Result<f64, EditError> {
+    // Asked in a world whose voxels have no size, a length in voxels is no number.
+    let world = size.world(f64::NAN);
+    if VOXEL_SIZES.contains(&world) {
+        return Ok(world);
+    }
+    let accepted = format!("a size in world units between {:e} and {:e}", VOXEL_SIZES.start(), VOXEL_SIZES.end());
+    Err(EditError::parameter(operation, "voxel_size", size, accepted))
 }
 
 /// Comma-separated numbers.

@@ -6,6 +6,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::params::{WorldLength, voxel_size};
 use super::registry::{Arity, Operator, Outcome};
 use crate::error::{EditError, Result};
 use crate::grid::{MAX_COORD, Transform};
@@ -22,7 +23,7 @@ pub struct Shape {
     pub spec: String,
     /// Edge of a voxel in world units.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub voxel_size: Option<f64>,
+    pub voxel_size: Option<WorldLength>,
     /// Voxels along the longest edge of the solid's box, instead of a voxel size; 256 if neither is given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub resolution: Option<u32>,
@@ -40,10 +41,12 @@ impl Default for Shape {
 const DEFAULT_RESOLUTION: u32 = 256;
 
 impl Shape {
-    fn resolved_voxel_size(&self, solid: &Solid) -> f64 {
+    fn resolved_voxel_size(&self, solid: &Solid) -> Result<f64> {
+        if let Some(size) = self.voxel_size {
+            return voxel_size(Self::NAME, size);
+        }
         let (lo, hi) = solid.bounds();
-        let longest = (hi - lo).max_element();
-        self.voxel_size.unwrap_or_else(|| longest / f64::from(self.resolution.unwrap_or(DEFAULT_RESOLUTION)))
+        Ok((hi - lo).max_element() / f64::from(self.resolution.unwrap_or(DEFAULT_RESOLUTION)))
     }
 }
 
@@ -64,7 +67,7 @@ impl Operator for Shape {
         if self.resolution == Some(0) {
             return Err(EditError::parameter(Self::NAME, "resolution", 0, "1 voxel or more"));
         }
-        let size = self.resolved_voxel_size(&solid);
+        let size = self.resolved_voxel_size(&solid)?;
         MeshToLevelSet { half_width: self.half_width, ..MeshToLevelSet::new(size) }.validate()?;
         let (lo, hi) = solid.bounds();
         let farthest = lo.abs().max(hi.abs()).max_element() / size + f64::from(self.half_width) + 2.0;
@@ -82,7 +85,7 @@ impl Operator for Shape {
     fn apply(&self, _: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
         self.validate()?;
         let solid = Solid::parse(&self.spec)?;
-        let size = self.resolved_voxel_size(&solid);
+        let size = self.resolved_voxel_size(&solid)?;
         let (lo, hi) = solid.bounds();
         let margin = f64::from(self.half_width) + 2.0;
         let bounds = ((lo / size - margin).floor().as_ivec3(), (hi / size + margin).ceil().as_ivec3());
@@ -112,7 +115,7 @@ mod tests {
     use super::*;
 
     fn make(spec: &str, voxel_size: f64) -> LevelSet {
-        let shape = Shape { spec: spec.into(), voxel_size: Some(voxel_size), ..Shape::default() };
+        let shape = Shape { spec: spec.into(), voxel_size: Some(WorldLength::new(voxel_size)), ..Shape::default() };
         shape.apply(Vec::new(), &RunOptions::default()).unwrap().level_set
     }
 
@@ -164,8 +167,14 @@ mod tests {
         };
         assert!(!bad(|_| ()));
         assert!(
-            bad(|s| s.voxel_size = Some(0.0)) && bad(|s| s.voxel_size = Some(-1.0)) && bad(|s| s.resolution = Some(0))
+            bad(|s| s.voxel_size = Some(WorldLength::new(0.0)))
+                && bad(|s| s.voxel_size = Some(WorldLength::new(-1.0)))
+                && bad(|s| s.resolution = Some(0))
         );
-        assert!(bad(|s| s.voxel_size = Some(1e-12)) && bad(|s| s.half_width = 0.0) && bad(|s| s.spec = "cube".into()));
+        assert!(
+            bad(|s| s.voxel_size = Some(WorldLength::new(1e-12)))
+                && bad(|s| s.half_width = 0.0)
+                && bad(|s| s.spec = "cube".into())
+        );
     }
 }

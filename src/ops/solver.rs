@@ -81,8 +81,7 @@ pub struct EvolutionOptions {
     /// Flow time instead of a number of steps, in world units squared (a sphere of radius R shrinks as R² − 2·time).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub time: Option<f64>,
-    /// Where to act, and how strongly, such as `sphere center=0,0,0 radius=1`; everywhere if not given. Several multiply; one
-    /// that begins with `or` is united with those before, one with `not` left out.
+    /// Where to act, and how strongly; everywhere if not given. Kinds: `sphere`, `box`, `bbox`, `cylinder`, `superellipsoid`. Several multiply.
     pub region: RegionSpecs,
     /// One-sided differences of the renormalisation after each step; weno5 if not given.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -5,14 +5,14 @@
 //! voxels are renamed; otherwise exact distances to the moved polygonised surface are computed (error 3/8·h²κ
 //! at most where it is smooth). `keep_grid` changes the grid's transform alone and no voxel.
 
-use glam::{DAffine3, DQuat, DVec3};
+use glam::{DAffine3, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::params::{Vector, parse_numbers};
+use super::params::{Vector, WorldLength, parse_numbers, voxel_size};
 use super::registry::{Arity, Operator, Outcome};
 use crate::error::{EditError, Result};
-use crate::grid::{Transform, VOXEL_SIZES};
+use crate::grid::Transform;
 use crate::levelset::LevelSet;
 use crate::mesh::onto_lattice;
 use crate::run::RunOptions;
@@ -31,7 +31,7 @@ pub struct TransformOperator {
     pub keep_grid: bool,
     /// Voxel size of the result; that of the input times the scale if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub voxel_size: Option<f64>,
+    pub voxel_size: Option<WorldLength>,
 }
 
 impl TransformOperator {
@@ -99,10 +99,7 @@ impl Operator for TransformOperator {
                     "without `keep_grid`, which resamples nothing",
                 ));
             }
-            if !VOXEL_SIZES.contains(&size) {
-                let accepted = format!("{:e} to {:e} world units", VOXEL_SIZES.start(), VOXEL_SIZES.end());
-                return Err(EditError::parameter(Self::NAME, "voxel_size", size, accepted));
-            }
+            voxel_size(Self::NAME, size)?;
         }
         Ok(())
     }
@@ -115,19 +112,17 @@ impl Operator for TransformOperator {
         if self.keep_grid {
             return Ok(moved.into());
         }
-        let voxel_size = self.voxel_size.unwrap_or_else(|| rounded(moved.voxel_size(), input.voxel_size()));
-        Ok(onto_lattice(&moved, &Transform::uniform(voxel_size), input.half_width(), run)?.into())
+        let size = match self.voxel_size {
+            Some(size) => voxel_size(Self::NAME, size)?,
+            None => rounded(moved.voxel_size(), input.voxel_size()),
+        };
+        Ok(onto_lattice(&moved, &Transform::uniform(size), input.half_width(), run)?.into())
     }
 }
 
 /// A rotation's rounding must not change the voxel size in its last digit: then nothing would lie on one lattice any more.
 fn rounded(moved: f64, original: f64) -> f64 {
     if (moved / original - 1.0).abs() < 1e-12 { original } else { moved }
-}
-
-/// The rotation of a quaternion or axis and angle, for library users.
-pub fn rotation(quaternion: DQuat) -> String {
-    format!("rotate {},{},{},{}", quaternion.x, quaternion.y, quaternion.z, quaternion.w)
 }
 
 #[cfg(test)]

@@ -5,15 +5,18 @@
 //! or 1.0 voxel for RK1, RK2, RK3. First order shifts the zero set by about 0.04 voxel where it is repeated to
 //! convergence; a step or two after each step of a flow shifts it far less.
 
-use super::step::{LeafKernel, Target, for_each_row};
+use fearless_simd::{Simd, SimdBase, SimdFloat};
+
+use super::step::{LeafKernel, Target};
 use super::tracker::Tracker;
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::Result;
 use crate::grid::{Grid, LeafId, LeafMask, LeafValues};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
+use crate::stencil::simd::Lanes;
 use crate::stencil::upwind::{UpwindScheme, WenoEpsilon, godunov_first, godunov_weno5};
-use crate::stencil::{Halo, Row};
+use crate::stencil::{Halo, StarHalo};
 
 /// Renormalises the whole band `solver.normalizations` times. The band itself stays as it is.
 pub fn renormalize(level_set: &mut LevelSet, solver: &SolverOptions, run: &RunOptions) -> Result<()> {
@@ -51,51 +54,66 @@ struct RenormalizationStep {
 
 impl RenormalizationStep {
     #[inline(always)]
-    fn row(&self, phi: &Row, norm2: &Row, out: &mut [f32]) {
-        let inverse = 1.0 / self.voxel_size;
-        for z in 0..8 {
-            let p = phi[z];
-            // 1e-8 keeps 0/0 from the voxel that lies on the surface of a flat field; as in OpenVDB.
-            let sign = p / ((p * p + norm2[z]).sqrt() + 1e-8);
-            out[z] = p - self.dt * sign * (norm2[z].sqrt() * inverse - 1.0);
-        }
+    fn euler<S: Simd>(&self, simd: S, phi: Lanes<S>, norm2: Lanes<S>) -> Lanes<S> {
+        // 1e-8 keeps 0/0 from a voxel that lies on the surface of a flat field; as in OpenVDB.
+        let sign = phi / ((phi * phi + norm2).sqrt() + 1e-8);
+        let excess = norm2.sqrt() * (1.0 / self.voxel_size) - Lanes::splat(simd, 1.0);
+        phi - sign * self.dt * excess
     }
 }
 
 struct FirstOrder(RenormalizationStep);
 
 impl LeafKernel for FirstOrder {
-    type Scratch = Halo<10>;
+    type Scratch = Halo;
 
-    fn scratch(&self) -> Halo<10> {
+    fn scratch(&self) -> Halo {
         Halo::new()
     }
 
     #[inline(always)]
-    fn euler(&self, grid: &Grid, id: LeafId, rows: LeafMask, halo: &mut Halo<10>, out: &mut LeafValues) {
-        halo.gather_star(grid.value_pages(), &grid.neighbours()[id.index()]);
-        for_each_row(rows, |x, y| {
-            let at = x * 64 + y * 8;
-            self.0.row(halo.row(x, y, [0; 3]), &godunov_first(halo, x, y), &mut out.0[at..at + 8]);
-        });
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, halo: &mut Halo, out: &mut LeafValues) {
+        halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
+        rows.for_each_pair(
+            #[inline(always)]
+            |x, y, _| {
+                let at = x * 64 + y * 8;
+                let phi = halo.rows(simd, x, y, [0; 3]);
+                self.0.euler(simd, phi, godunov_first(simd, halo, x, y)).store_slice(&mut out.0[at..at + 16]);
+            },
+        );
     }
 }
 
 struct Weno5(RenormalizationStep, WenoEpsilon);
 
 impl LeafKernel for Weno5 {
-    type Scratch = Halo<14>;
+    type Scratch = StarHalo;
 
-    fn scratch(&self) -> Halo<14> {
-        Halo::new()
+    fn scratch(&self) -> StarHalo {
+        StarHalo::new()
     }
 
     #[inline(always)]
-    fn euler(&self, grid: &Grid, id: LeafId, rows: LeafMask, halo: &mut Halo<14>, out: &mut LeafValues) {
-        halo.gather_star(grid.value_pages(), &grid.neighbours()[id.index()]);
-        for_each_row(rows, |x, y| {
-            let at = x * 64 + y * 8;
-            self.0.row(halo.row(x, y, [0; 3]), &godunov_weno5(halo, x, y, self.1), &mut out.0[at..at + 8]);
-        });
+    fn euler<S: Simd>(
+        &self,
+        simd: S,
+        grid: &Grid,
+        id: LeafId,
+        rows: LeafMask,
+        halo: &mut StarHalo,
+        out: &mut LeafValues,
+    ) {
+        halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
+        rows.for_each_pair(
+            #[inline(always)]
+            |x, y, _| {
+                let at = x * 64 + y * 8;
+                let phi = halo.centre(simd, x, y);
+                self.0
+                    .euler(simd, phi, godunov_weno5(simd, halo, x, y, self.0.voxel_size, self.1))
+                    .store_slice(&mut out.0[at..at + 16]);
+            },
+        );
     }
 }

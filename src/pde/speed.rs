@@ -1,9 +1,12 @@
 //! What a flow says: how fast the surface moves, once a leaf, on arrays.
 
-use super::step::{LeafKernel, for_each_row};
+use fearless_simd::{Simd, SimdBase};
+
+use super::step::LeafKernel;
 use crate::grid::{Grid, LEAF_VOXELS, LeafId, LeafMask, LeafValues};
 use crate::stencil::Halo;
 use crate::stencil::curvature::{laplacian, mean_curvature};
+use crate::stencil::simd::Lanes;
 
 /// The |∇φ| that a speed is multiplied with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -57,7 +60,7 @@ pub(super) struct FlowStep<'a> {
 
 /// Buffers of a task.
 pub(super) struct FlowScratch {
-    halo: Halo<10>,
+    halo: Halo,
     fields: LeafFields,
     speed: [f32; LEAF_VOXELS],
 }
@@ -75,34 +78,45 @@ impl LeafKernel for FlowStep<'_> {
     }
 
     #[inline(always)]
-    fn euler(&self, grid: &Grid, id: LeafId, rows: LeafMask, scratch: &mut FlowScratch, out: &mut LeafValues) {
+    fn euler<S: Simd>(
+        &self,
+        simd: S,
+        grid: &Grid,
+        id: LeafId,
+        rows: LeafMask,
+        scratch: &mut FlowScratch,
+        out: &mut LeafValues,
+    ) {
         let FlowScratch { halo, fields, speed } = scratch;
         let wants = self.function.wants();
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
-        for_each_row(rows, |x, y| {
-            let at = x * 64 + y * 8;
-            if wants.mean_curvature {
-                let row = mean_curvature(halo, x, y, self.voxel_size);
-                fields.mean_curvature[at..at + 8].copy_from_slice(&row.mean);
-                fields.gradient[at..at + 8].copy_from_slice(&row.gradient);
-            }
-            if wants.laplacian {
-                fields.laplacian[at..at + 8].copy_from_slice(&laplacian(halo, x, y, self.voxel_size));
-            }
-        });
+        rows.for_each_pair(
+            #[inline(always)]
+            |x, y, _| {
+                let at = x * 64 + y * 8;
+                if wants.mean_curvature {
+                    let rows = mean_curvature(simd, halo, x, y, self.voxel_size);
+                    rows.mean.store_slice(&mut fields.mean_curvature[at..at + 16]);
+                    rows.gradient.store_slice(&mut fields.gradient[at..at + 16]);
+                }
+                if wants.laplacian {
+                    let rows = laplacian(simd, halo, x, y, self.voxel_size);
+                    rows.store_slice(&mut fields.laplacian[at..at + 16]);
+                }
+            },
+        );
         self.function.speed(fields, speed);
-        let phi = &grid.values(id).0;
-        match self.function.gradient_norm() {
-            GradientNorm::Central => {
-                for i in 0..LEAF_VOXELS {
-                    out.0[i] = phi[i] - self.dt * speed[i] * fields.gradient[i];
+        let central = self.function.gradient_norm() == GradientNorm::Central;
+        rows.for_each_pair(
+            #[inline(always)]
+            |x, y, _| {
+                let at = x * 64 + y * 8;
+                let mut rate = Lanes::from_slice(simd, &speed[at..at + 16]) * self.dt;
+                if central {
+                    rate *= Lanes::from_slice(simd, &fields.gradient[at..at + 16]);
                 }
-            }
-            GradientNorm::Unit => {
-                for i in 0..LEAF_VOXELS {
-                    out.0[i] = phi[i] - self.dt * speed[i];
-                }
-            }
-        }
+                (halo.rows(simd, x, y, [0; 3]) - rate).store_slice(&mut out.0[at..at + 16]);
+            },
+        );
     }
 }

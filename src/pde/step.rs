@@ -1,11 +1,13 @@
-//! The driver: gathers leaves, runs a kernel on their active rows, writes the voxels that may be written.
+//! The driver: runs a kernel on the active rows of leaves, writes the voxels that may be written.
 //!
 //! Masks and regions are handled here and nowhere else.
+
+use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 
 use super::domain::Domain;
 use super::tracker::Tracker;
 use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged};
-use crate::stencil::simd::{self, Work};
+use crate::stencil::simd::{self, Lanes, Work};
 
 /// One explicit Euler step on a leaf.
 pub(super) trait LeafKernel: Sync {
@@ -15,9 +17,17 @@ pub(super) trait LeafKernel: Sync {
     /// New buffers.
     fn scratch(&self) -> Self::Scratch;
 
-    /// Computes φ + dt·L(φ) for the rows of leaf `id` that have a bit in `rows`; other rows of `out` are not read.
+    /// Computes φ + dt·L(φ) for the row pairs of leaf `id` that have a bit in `rows`; the others of `out` are not read.
     /// Must be `#[inline(always)]`.
-    fn euler(&self, grid: &Grid, id: LeafId, rows: LeafMask, scratch: &mut Self::Scratch, out: &mut LeafValues);
+    fn euler<S: Simd>(
+        &self,
+        simd: S,
+        grid: &Grid,
+        id: LeafId,
+        rows: LeafMask,
+        scratch: &mut Self::Scratch,
+        out: &mut LeafValues,
+    );
 }
 
 /// Which voxels a step writes.
@@ -80,65 +90,52 @@ struct PageStep<'a, K> {
 
 impl<K: LeafKernel> Work for PageStep<'_, K> {
     #[inline(always)]
-    fn run(self) {
+    fn run<S: Simd>(self, simd: S) {
         let mut scratch = self.kernel.scratch();
         let mut new = LeafValues::default();
-        self.leaves.for_each(|id| {
-            let out = &mut self.page[PageLeaves::slot(id)];
-            let phi = self.grid.values(id);
-            let active = self.grid.mask(id);
-            let (write, alpha) = match self.target {
-                Target::Moving => (self.domain.moving(id, active), self.domain.weights().map(|w| w.alpha(id))),
-                Target::Repairable => (self.domain.repairable(id, active), None),
-            };
-            if self.domain.is_local() && self.blend.old == 0.0 {
-                // The buffer may hold an older state of voxels that this step does not write.
-                out.0 = phi.0;
-            }
-            if write.is_empty() {
-                return;
-            }
-            self.kernel.euler(self.grid, id, write, &mut scratch, &mut new);
-            if let Some(alpha) = alpha {
-                for (n, (p, a)) in new.0.iter_mut().zip(phi.0.iter().zip(&alpha.0)) {
-                    *n = (1.0 - a) * p + a * *n;
+        self.leaves.for_each(
+            #[inline(always)]
+            |id| {
+                let out = &mut self.page[PageLeaves::slot(id)];
+                let phi = self.grid.values(id);
+                let active = self.grid.mask(id);
+                let (write, alpha) = match self.target {
+                    Target::Moving => (self.domain.moving(id, active), self.domain.weights().map(|w| w.alpha(id))),
+                    Target::Repairable => (self.domain.repairable(id, active), None),
+                };
+                if self.domain.is_local() && self.blend.old == 0.0 {
+                    // The buffer may hold an older state of voxels that this step does not write.
+                    out.0 = phi.0;
                 }
-            }
-            if self.blend.old != 0.0 {
-                let old = self.old.map_or(&*out, |buffer| buffer.get(id));
-                for (n, o) in new.0.iter_mut().zip(&old.0) {
-                    *n = self.blend.old * o + self.blend.new * *n;
+                if write.is_empty() {
+                    return;
                 }
-            }
-            store(write, &new, out);
-        });
+                self.kernel.euler(simd, self.grid, id, write, &mut scratch, &mut new);
+                write.for_each_pair(
+                    #[inline(always)]
+                    |x, y, bits| {
+                        let at = x * 64 + y * 8;
+                        let mut value = load(simd, &new, at);
+                        if let Some(alpha) = alpha {
+                            let a = load(simd, alpha, at);
+                            value = (Lanes::splat(simd, 1.0) - a) * load(simd, phi, at) + a * value;
+                        }
+                        let before = load(simd, out, at);
+                        if self.blend.old != 0.0 {
+                            let old = self.old.map_or(before, |buffer| load(simd, buffer.get(id), at));
+                            value = old * self.blend.old + value * self.blend.new;
+                        }
+                        let mask = mask32x16::from_bitmask(simd, u64::from(bits));
+                        mask.select(value, before).store_slice(&mut out.0[at..at + 16]);
+                    },
+                );
+            },
+        );
     }
 }
 
-/// Calls `f` with every row (x, y) that has a bit in `rows`.
+/// Two rows of a leaf.
 #[inline(always)]
-pub(super) fn for_each_row(rows: LeafMask, mut f: impl FnMut(usize, usize)) {
-    for x in 0..8 {
-        if rows.0[x] == 0 {
-            continue;
-        }
-        for y in 0..8 {
-            if rows.row(x, y) != 0 {
-                f(x, y);
-            }
-        }
-    }
-}
-
-/// Writes the voxels of `mask`, a row at a time.
-#[inline(always)]
-fn store(mask: LeafMask, new: &LeafValues, out: &mut LeafValues) {
-    for_each_row(mask, |x, y| {
-        let bits = mask.row(x, y);
-        let at = x * 64 + y * 8;
-        for z in 0..8 {
-            let i = at + z;
-            out.0[i] = if bits >> z & 1 == 1 { new.0[i] } else { out.0[i] };
-        }
-    });
+fn load<S: Simd>(simd: S, leaf: &LeafValues, at: usize) -> Lanes<S> {
+    Lanes::from_slice(simd, &leaf.0[at..at + 16])
 }

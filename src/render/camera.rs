@@ -153,8 +153,8 @@ pub(super) fn points_to_frame(level_set: &LevelSet, frame: Frame) -> Vec<(DVec3,
         .collect()
 }
 
-/// For every leaf with surface, the box of its voxels less than a voxel from the surface: together they hold it, and exceed
-/// it by less than a voxel.
+/// For every leaf with surface, the box of its voxels less than a voxel from the surface. Together they hold the surface;
+/// their corners stick out by a few voxels where it runs obliquely, so a very coarse object gets a wider margin.
 fn surface_boxes(level_set: &LevelSet) -> Vec<(IVec3, IVec3)> {
     let grid = level_set.grid();
     let reach = level_set.voxel_size() as f32;

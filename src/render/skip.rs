@@ -108,7 +108,7 @@ impl SkipMap {
 
 /// Origins of the leaves (`id` and those below it along the axes) that have a cell with a corner in `id` and a change of sign.
 fn leaves_with_surface(grid: &Grid, id: LeafId) -> Vec<IVec3> {
-    let mut halo = Halo::<10>::new();
+    let mut halo = Halo::new();
     halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
     // The first cells begin one voxel below the leaf: a cell belongs to the leaf of its first corner.
     let mixed = |below: IVec3| {

@@ -1,4 +1,4 @@
-//! Curvature of the level sets of φ along a row, second order.
+//! Curvature of the level sets of φ, second order.
 //!
 //! With unscaled central differences Dx = (φ₊ − φ₋)/2, Dxx = φ₊ − 2φ + φ₋, Dxy = (φ₊₊ − φ₊₋ − φ₋₊ + φ₋₋)/4,
 //!
@@ -7,62 +7,58 @@
 //! H = (κ₁ + κ₂)/2 = div(∇φ/|∇φ|)/2 is positive on convex parts (φ negative inside). Where the gradient vanishes
 //! (the medial axis, flat parts beyond the band) the curvature is taken as 0.
 
-use super::{Halo, Row};
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
+
+use super::Halo;
+use super::simd::Lanes;
 
 /// Below this part of a voxel size, squared, a central difference counts as no gradient. A distance field has |Dφ| = 1 voxel size.
 const FLAT_SQUARED: f32 = 1e-12;
 
-/// Mean curvature and gradient norm of a row.
-pub struct MeanCurvature {
+/// Mean curvature and gradient norm.
+pub struct MeanCurvature<S: Simd> {
     /// H in 1/world.
-    pub mean: Row,
+    pub mean: Lanes<S>,
     /// |∇φ| by central differences, dimensionless.
-    pub gradient: Row,
+    pub gradient: Lanes<S>,
 }
 
-/// H (1/world) and central |∇φ| of row (x, y).
+/// H (1/world) and central |∇φ| of rows (x, y) and (x, y + 1).
 #[inline(always)]
-pub fn mean_curvature(halo: &Halo<10>, x: usize, y: usize, voxel_size: f32) -> MeanCurvature {
-    let at = |dx, dy, dz| halo.row(x, y, [dx, dy, dz]);
-    let (c, xm, xp) = (at(0, 0, 0), at(-1, 0, 0), at(1, 0, 0));
-    let (ym, yp, zm, zp) = (at(0, -1, 0), at(0, 1, 0), at(0, 0, -1), at(0, 0, 1));
-    let (xmym, xmyp, xpym, xpyp) = (at(-1, -1, 0), at(-1, 1, 0), at(1, -1, 0), at(1, 1, 0));
-    let (xmzm, xmzp, xpzm, xpzp) = (at(-1, 0, -1), at(-1, 0, 1), at(1, 0, -1), at(1, 0, 1));
-    let (ymzm, ymzp, ypzm, ypzp) = (at(0, -1, -1), at(0, -1, 1), at(0, 1, -1), at(0, 1, 1));
+pub fn mean_curvature<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> MeanCurvature<S> {
+    macro_rules! at {
+        ($dx:expr, $dy:expr, $dz:expr) => {
+            halo.rows(simd, x, y, [$dx, $dy, $dz])
+        };
+    }
+    let (c, xm, xp) = (at!(0, 0, 0), at!(-1, 0, 0), at!(1, 0, 0));
+    let (ym, yp, zm, zp) = (at!(0, -1, 0), at!(0, 1, 0), at!(0, 0, -1), at!(0, 0, 1));
+    let (dx, dy, dz) = ((xp - xm) * 0.5, (yp - ym) * 0.5, (zp - zm) * 0.5);
+    let (dx2, dy2, dz2) = (dx * dx, dy * dy, dz * dz);
+    let norm2 = dx2 + dy2 + dz2;
+    let twice = c + c;
+    let (dxx, dyy, dzz) = (xp + xm - twice, yp + ym - twice, zp + zm - twice);
+    let dxy = ((at!(1, 1, 0) - at!(1, -1, 0)) - (at!(-1, 1, 0) - at!(-1, -1, 0))) * 0.25;
+    let dxz = ((at!(1, 0, 1) - at!(1, 0, -1)) - (at!(-1, 0, 1) - at!(-1, 0, -1))) * 0.25;
+    let dyz = ((at!(0, 1, 1) - at!(0, 1, -1)) - (at!(0, -1, 1) - at!(0, -1, -1))) * 0.25;
+    let alpha =
+        dx2 * (dyy + dzz) + dy2 * (dxx + dzz) + dz2 * (dxx + dyy) - (dx * (dy * dxy + dz * dxz) + dy * dz * dyz) * 2.0;
+    let norm = norm2.sqrt();
     let inverse = 1.0 / voxel_size;
-    let flat = FLAT_SQUARED * voxel_size * voxel_size;
-    let mut out = MeanCurvature { mean: [0.0; 8], gradient: [0.0; 8] };
-    for z in 0..8 {
-        let (dx, dy, dz) = (0.5 * (xp[z] - xm[z]), 0.5 * (yp[z] - ym[z]), 0.5 * (zp[z] - zm[z]));
-        let (dx2, dy2, dz2) = (dx * dx, dy * dy, dz * dz);
-        let norm2 = dx2 + dy2 + dz2;
-        let twice = c[z] + c[z];
-        let (dxx, dyy, dzz) = (xp[z] + xm[z] - twice, yp[z] + ym[z] - twice, zp[z] + zm[z] - twice);
-        let dxy = 0.25 * ((xpyp[z] - xpym[z]) - (xmyp[z] - xmym[z]));
-        let dxz = 0.25 * ((xpzp[z] - xpzm[z]) - (xmzp[z] - xmzm[z]));
-        let dyz = 0.25 * ((ypzp[z] - ypzm[z]) - (ymzp[z] - ymzm[z]));
-        let alpha = dx2 * (dyy + dzz) + dy2 * (dxx + dzz) + dz2 * (dxx + dyy)
-            - 2.0 * (dx * (dy * dxy + dz * dxz) + dy * dz * dyz);
-        let norm = norm2.sqrt();
-        let curved = norm2 > flat;
-        // H = alpha / (2 |Dφ|³ dx); the quotient by the square first keeps small voxel sizes within f32.
-        let mean = alpha / norm2 / (2.0 * norm) * inverse;
-        out.mean[z] = if curved { mean } else { 0.0 };
-        out.gradient[z] = norm * inverse;
-    }
-    out
+    let curved = norm2.simd_gt(FLAT_SQUARED * voxel_size * voxel_size);
+    // H = alpha / (2 |Dφ|³ dx); the quotient by the square first keeps small voxel sizes within f32.
+    let mean = alpha / norm2 / (norm * 2.0) * inverse;
+    MeanCurvature { mean: curved.select(mean, Lanes::splat(simd, 0.0)), gradient: norm * inverse }
 }
 
-/// Laplacian of a row: Δφ in 1/world.
+/// Laplacian: Δφ in 1/world.
 #[inline(always)]
-pub fn laplacian(halo: &Halo<10>, x: usize, y: usize, voxel_size: f32) -> Row {
-    let at = |dx, dy, dz| halo.row(x, y, [dx, dy, dz]);
-    let (c, xm, xp) = (at(0, 0, 0), at(-1, 0, 0), at(1, 0, 0));
-    let (ym, yp, zm, zp) = (at(0, -1, 0), at(0, 1, 0), at(0, 0, -1), at(0, 0, 1));
-    let inverse2 = 1.0 / (voxel_size * voxel_size);
-    let mut out = [0.0; 8];
-    for z in 0..8 {
-        out[z] = ((xp[z] + xm[z]) + (yp[z] + ym[z]) + (zp[z] + zm[z]) - 6.0 * c[z]) * inverse2;
+pub fn laplacian<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
+    macro_rules! at {
+        ($dx:expr, $dy:expr, $dz:expr) => {
+            halo.rows(simd, x, y, [$dx, $dy, $dz])
+        };
     }
-    out
+    let sum = (at!(1, 0, 0) + at!(-1, 0, 0)) + (at!(0, 1, 0) + at!(0, -1, 0)) + (at!(0, 0, 1) + at!(0, 0, -1));
+    (sum - at!(0, 0, 0) * 6.0) * (1.0 / (voxel_size * voxel_size))
 }

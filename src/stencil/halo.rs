@@ -1,127 +1,215 @@
-//! A leaf and its rim in one contiguous buffer.
+//! A leaf and its rim in one contiguous buffer, laid out so that every operand of a stencil is a plain vector load.
+//!
+//! Kernels work on two rows of a leaf at once: (x, y) and (x, y + 1), y even, 16 values. A shift in x or y moves to other
+//! rows; a shift in z would straddle rows, so the leaf is gathered once for each shift in z, every row 8 values long.
 
+use fearless_simd::{Simd, SimdBase};
 use glam::IVec3;
 
+use super::simd::Lanes;
 use crate::grid::{LeafValues, Neighbours, Paged};
 
 /// Eight voxels along z.
 pub type Row = [f32; 8];
 
-/// A leaf with a rim of `(S − 8) / 2` voxels on every side: `Halo<10>` for one-voxel stencils, `Halo<14>` for WENO5.
+/// A leaf with a rim of one voxel: for stencils over the 27 voxels around each.
 #[repr(align(64))]
-pub struct Halo<const S: usize>([[[f32; S]; S]; S]);
+pub struct Halo {
+    /// By shift in z (−1, 0, 1), then x; ten rows of 8 along y.
+    slabs: [[[f32; 80]; 10]; 3],
+}
 
-impl<const S: usize> Halo<S> {
-    /// Width of the rim in voxels.
-    pub const RIM: usize = (S - 8) / 2;
-
-    /// A buffer to gather into; the contents have no meaning yet.
+impl Halo {
+    /// A buffer to gather into.
     pub fn new() -> Self {
-        Self([[[0.0; S]; S]; S])
+        Self { slabs: [[[0.0; 80]; 10]; 3] }
     }
 
     /// Copies the leaf in the middle of `around` and the rim from its 26 neighbours.
     #[inline(always)]
     pub fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
-        for q in 0..9 {
-            self.gather_columns(values, around, q / 3, q % 3);
-        }
-    }
-
-    /// Copies the leaf and the rims across its six faces only; edges and corners keep what they held. For stencils that
-    /// look along the axes.
-    #[inline(always)]
-    pub fn gather_star(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
-        self.gather_columns(values, around, 1, 1);
-        for (i, j) in [(0, 1), (2, 1), (1, 0), (1, 2)] {
-            let centre = &values.get(around[(i * 9) + (j * 3) + 1]).0;
-            for (x, sx) in Self::span(i) {
-                for (y, sy) in Self::span(j) {
-                    let from = sx * 64 + sy * 8;
-                    self.0[x][y][Self::RIM..Self::RIM + 8].copy_from_slice(&centre[from..from + 8]);
-                }
+        for x in 0..10 {
+            // The neighbour in x, and the slab of it.
+            let (i, from) = match x {
+                0 => (0, 7),
+                9 => (2, 0),
+                _ => (1, x - 1),
+            };
+            for (j, rows, first, count) in [(0, 7, 0, 1), (1, 0, 1, 8), (2, 0, 9, 1)] {
+                let leaf = |k: usize| &values.get(around[i * 9 + j * 3 + k]).0[from * 64 + rows * 8..][..count * 8];
+                let (below, centre, above) = (leaf(0), leaf(1), leaf(2));
+                let to = first * 8..(first + count) * 8;
+                self.slabs[1][x][to.clone()].copy_from_slice(centre);
+                shift_up(&mut self.slabs[0][x][to.clone()], centre, below, 1);
+                shift_down(&mut self.slabs[2][x][to], centre, above, 1);
             }
         }
     }
 
-    /// The (halo, leaf) coordinates along one axis of what neighbour 0 (below), 1 (this) or 2 (above) gives.
+    /// Rows (x, y) and (x, y + 1) shifted by (dx, dy, dz), each −1, 0 or 1.
     #[inline(always)]
-    fn span(side: usize) -> impl Iterator<Item = (usize, usize)> {
-        let (first, from, count) = match side {
-            0 => (0, 8 - Self::RIM, Self::RIM),
-            1 => (Self::RIM, 0, 8),
-            _ => (Self::RIM + 8, 0, Self::RIM),
-        };
-        (0..count).map(move |k| (first + k, from + k))
-    }
-
-    #[inline(always)]
-    fn gather_columns(&mut self, values: &Paged<LeafValues>, around: &Neighbours, i: usize, j: usize) {
-        let rim = Self::RIM;
-        let [below, centre, above] = std::array::from_fn(|k| &values.get(around[i * 9 + j * 3 + k]).0);
-        for (x, sx) in Self::span(i) {
-            for (y, sy) in Self::span(j) {
-                let from = sx * 64 + sy * 8;
-                let row = &mut self.0[x][y];
-                row[..rim].copy_from_slice(&below[from + 8 - rim..from + 8]);
-                row[rim..rim + 8].copy_from_slice(&centre[from..from + 8]);
-                row[rim + 8..].copy_from_slice(&above[from..from + rim]);
-            }
-        }
-    }
-
-    /// The value at a voxel in the leaf's own coordinates, within the rim.
-    #[inline(always)]
-    pub fn value(&self, local: IVec3) -> f32 {
-        let at = |i: i32| (i + Self::RIM as i32) as usize;
-        self.0[at(local.x)][at(local.y)][at(local.z)]
-    }
-
-    /// The 8 values of row (x, y) shifted by (dx, dy, dz) voxels, each shift within the rim.
-    #[inline(always)]
-    pub fn row(&self, x: usize, y: usize, [dx, dy, dz]: [isize; 3]) -> &Row {
-        let at = |i: usize, d: isize| (i + Self::RIM).wrapping_add_signed(d);
-        let row = &self.0[at(x, dx)][at(y, dy)];
-        row[at(0, dz)..].first_chunk().unwrap_or(&[0.0; 8])
+    pub fn rows<S: Simd>(&self, simd: S, x: usize, y: usize, [dx, dy, dz]: [isize; 3]) -> Lanes<S> {
+        let slab = &self.slabs[dz.wrapping_add(1) as usize][(x + 1).wrapping_add_signed(dx)];
+        Lanes::from_slice(simd, &slab[(y + 1).wrapping_add_signed(dy) * 8..][..16])
     }
 }
 
-impl<const S: usize> Default for Halo<S> {
+impl Halo {
+    /// Row (x, y) shifted by (dx, dy, dz), each −1, 0 or 1.
+    #[inline(always)]
+    pub fn row(&self, x: usize, y: usize, [dx, dy, dz]: [isize; 3]) -> &Row {
+        let slab = &self.slabs[dz.wrapping_add(1) as usize][(x + 1).wrapping_add_signed(dx)];
+        &slab.as_chunks().0[(y + 1).wrapping_add_signed(dy)]
+    }
+
+    /// The value at a position relative to the leaf's first voxel, −1..8 along each axis.
+    #[inline(always)]
+    pub fn value(&self, ijk: IVec3) -> f32 {
+        // A voxel of the rim in z is the first or last of a row shifted towards it.
+        let z = ijk.z.clamp(0, 7);
+        let slab = &self.slabs[(ijk.z - z + 1) as usize][(ijk.x + 1) as usize];
+        slab[(ijk.y + 1) as usize * 8 + z as usize]
+    }
+}
+
+impl Default for Halo {
     fn default() -> Self {
         Self::new()
     }
 }
 
-/// The rows of a star-shaped stencil of ±R voxels along each axis around one row.
-pub struct Star<'a, const S: usize> {
-    halo: &'a Halo<S>,
-    x: usize,
-    y: usize,
+/// A leaf with what stencils of ±3 voxels along each axis read.
+#[repr(align(64))]
+pub struct StarHalo {
+    /// By x; fourteen rows of 8 along y.
+    slabs: [[f32; 112]; 14],
+    /// The leaf's own rows by shift in z (−3, −2, −1, 1, 2, 3), then x.
+    shifted: [[[f32; 64]; 8]; 6],
 }
 
-impl<'a, const S: usize> Star<'a, S> {
-    /// The star around row (x, y).
-    #[inline(always)]
-    pub fn new(halo: &'a Halo<S>, x: usize, y: usize) -> Self {
-        Self { halo, x, y }
+impl StarHalo {
+    /// A buffer to gather into.
+    pub fn new() -> Self {
+        Self { slabs: [[0.0; 112]; 14], shifted: [[[0.0; 64]; 8]; 6] }
     }
 
-    /// The row `step` voxels along `axis` (0 = x, 1 = y, 2 = z).
+    /// Copies the leaf in the middle of `around` and the three voxels beyond each of its faces.
     #[inline(always)]
-    pub fn at(&self, axis: usize, step: isize) -> &'a Row {
-        let mut shift = [0; 3];
-        shift[axis] = step;
-        self.halo.row(self.x, self.y, shift)
+    pub fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
+        let leaf = |q: usize| &values.get(around[q]).0;
+        let centre = leaf(13);
+        for x in 0..3 {
+            self.slabs[x][24..88].copy_from_slice(&leaf(4)[(5 + x) * 64..][..64]);
+            self.slabs[11 + x][24..88].copy_from_slice(&leaf(22)[x * 64..][..64]);
+        }
+        for x in 0..8 {
+            let slab = &mut self.slabs[3 + x];
+            slab[..24].copy_from_slice(&leaf(10)[x * 64 + 40..][..24]);
+            slab[24..88].copy_from_slice(&centre[x * 64..][..64]);
+            slab[88..].copy_from_slice(&leaf(16)[x * 64..][..24]);
+            let [own, below, above] = [13, 12, 14].map(|q| &leaf(q)[x * 64..][..64]);
+            for by in 1..=3 {
+                shift_up(&mut self.shifted[3 - by][x], own, below, by);
+                shift_down(&mut self.shifted[2 + by][x], own, above, by);
+            }
+        }
+    }
+
+    /// Rows (x, y) and (x, y + 1) of the leaf.
+    #[inline(always)]
+    pub fn centre<S: Simd>(&self, simd: S, x: usize, y: usize) -> Lanes<S> {
+        Lanes::from_slice(simd, &self.slabs[x + 3][(y + 3) * 8..][..16])
+    }
+
+    /// The rows at steps −3, −2, −1, 1, 2, 3 along `axis` (0 = x, 1 = y, 2 = z).
+    #[inline(always)]
+    pub fn along<S: Simd>(&self, simd: S, x: usize, y: usize, axis: usize) -> [Lanes<S>; 6] {
+        // Written out: a closure would not be inlined into the code of the chosen instruction set.
+        macro_rules! load {
+            ($($k:literal $step:literal),*) => {
+                match axis {
+                    0 => [$(Lanes::from_slice(simd, &self.slabs[x + $step][(y + 3) * 8..][..16])),*],
+                    1 => [$(Lanes::from_slice(simd, &self.slabs[x + 3][(y + $step) * 8..][..16])),*],
+                    _ => [$(Lanes::from_slice(simd, &self.shifted[$k][x][y * 8..][..16])),*],
+                }
+            };
+        }
+        load!(0 0, 1 1, 2 2, 3 4, 4 5, 5 6)
+    }
+}
+
+impl Default for StarHalo {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// Rows of 8 moved up in z: `to[z] = own[z − by]`, what enters below coming from the end of `below`'s rows.
+#[inline(always)]
+fn shift_up(to: &mut [f32], own: &[f32], below: &[f32], by: usize) {
+    let n = own.len();
+    // One copy for all rows; the first voxels of each are then put right.
+    to[by..n].copy_from_slice(&own[..n - by]);
+    for row in (0..n).step_by(8) {
+        to[row..row + by].copy_from_slice(&below[row + 8 - by..row + 8]);
+    }
+}
+
+/// Rows of 8 moved down in z: `to[z] = own[z + by]`.
+#[inline(always)]
+fn shift_down(to: &mut [f32], own: &[f32], above: &[f32], by: usize) {
+    let n = own.len();
+    to[..n - by].copy_from_slice(&own[by..]);
+    for row in (0..n).step_by(8) {
+        to[row + 8 - by..row + 8].copy_from_slice(&above[row..row + by]);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::grid::{Grid, leaf_offset, offset_to_local};
+    use crate::grid::{Grid, offset_to_local};
+    use crate::stencil::simd::{Work, dispatch};
 
     fn value(ijk: IVec3) -> f32 {
         (ijk.x * 1000 + ijk.y * 30 + ijk.z) as f32
+    }
+
+    struct Compare<'a>(&'a Grid);
+
+    impl Work for Compare<'_> {
+        fn run<S: Simd>(self, simd: S) {
+            let grid = self.0;
+            let centre = grid.find(IVec3::ZERO);
+            let around = &grid.neighbours()[centre.index()];
+            let (mut halo, mut star) = (Halo::new(), StarHalo::new());
+            halo.gather(grid.value_pages(), around);
+            star.gather(grid.value_pages(), around);
+            for x in 0..8usize {
+                for y in (0..8usize).step_by(2) {
+                    let at = |lane: usize| IVec3::new(x as i32, (y + lane / 8) as i32, (lane % 8) as i32);
+                    for q in 0..27isize {
+                        let d = [q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1];
+                        let rows = halo.rows(simd, x, y, d);
+                        assert!((0..8).all(|z| rows[z] == halo.row(x, y, d)[z]));
+                        for lane in 0..16 {
+                            let ijk = at(lane) + IVec3::from(d.map(|d| d as i32));
+                            assert_eq!((rows[lane], halo.value(ijk)), (value(ijk), value(ijk)));
+                        }
+                    }
+                    for axis in 0..3 {
+                        for (rows, step) in star.along(simd, x, y, axis).into_iter().zip([-3, -2, -1, 1, 2, 3]) {
+                            for lane in 0..16 {
+                                let mut ijk = at(lane);
+                                ijk[axis] += step;
+                                assert_eq!(rows[lane], value(ijk));
+                            }
+                        }
+                    }
+                    assert_eq!(star.centre(simd, x, y)[9], value(at(9)));
+                }
+            }
+        }
     }
 
     #[test]
@@ -135,27 +223,6 @@ mod tests {
                 *v = value(origin + offset_to_local(o));
             }
         });
-        let centre = grid.find(IVec3::ZERO);
-        let mut halo = Halo::<10>::new();
-        halo.gather(grid.value_pages(), &grid.neighbours()[centre.index()]);
-        let mut wide = Halo::<14>::new();
-        wide.gather_star(grid.value_pages(), &grid.neighbours()[centre.index()]);
-        for o in 0..512 {
-            let p = offset_to_local(o);
-            assert_eq!(leaf_offset(p), o);
-            let (x, y, z) = (p.x as usize, p.y as usize, p.z as usize);
-            for q in 0..27isize {
-                let d = [q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1];
-                let ijk = p + IVec3::new(d[0] as i32, d[1] as i32, d[2] as i32);
-                assert_eq!(halo.row(x, y, d)[z], value(ijk));
-            }
-            for axis in 0..3 {
-                for step in -3..=3 {
-                    let mut ijk = p;
-                    ijk[axis] += step;
-                    assert_eq!(Star::new(&wide, x, y).at(axis, step as isize)[z], value(ijk));
-                }
-            }
-        }
+        dispatch(Compare(&grid));
     }
 }

@@ -1,23 +1,25 @@
-//! Runs kernels compiled for the widest instruction set of the machine.
+//! Which vector instructions kernels run on.
 //!
-//! A kernel is plain Rust marked `#[inline(always)]`; [`dispatch`] inlines it into functions compiled with AVX2 and
-//! AVX-512 and picks one at run time. Rust never contracts a·b + c into a fused multiply-add nor reorders sums, so every
-//! instruction set gives the same bits; a test compares them.
-//!
-//! This file holds the only `unsafe` outside `vdb`: calling a function that needs an instruction set after finding out
-//! that the machine has it.
+//! Kernels are written once over `fearless_simd`'s sixteen-lane vectors, two rows of a leaf at a time, and compiled for
+//! every instruction set; [`dispatch`] picks one at run time. No fused multiply-add, no reciprocal estimate and no
+//! reordered sum is used, so every instruction set gives the same bits; a test compares them.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
-/// An instruction set that kernels can be compiled for.
+use fearless_simd::{Level, Simd, f32x16};
+
+/// Sixteen values: two rows of a leaf, z fastest.
+pub type Lanes<S> = f32x16<S>;
+
+/// An instruction set that kernels are compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
 pub enum Isa {
-    /// What every machine of the target has (SSE2 on x86-64).
+    /// What every machine of the target has (SSE2 on x86-64, NEON on AArch64).
     Portable = 1,
-    /// 256-bit vectors.
+    /// 256-bit vectors on x86-64.
     Avx2 = 2,
-    /// 512-bit registers and masks.
+    /// 512-bit vectors on x86-64, as of Ice Lake.
     Avx512 = 3,
 }
 
@@ -26,18 +28,30 @@ impl Isa {
     pub fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
         {
-            if is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512vl")
-                && is_x86_feature_detected!("avx512bw")
-                && is_x86_feature_detected!("avx512dq")
-            {
+            let level = Level::new();
+            if level.as_avx512().is_some() {
                 return Self::Avx512;
             }
-            if is_x86_feature_detected!("avx2") {
+            if level.as_avx2().is_some() {
                 return Self::Avx2;
             }
         }
         Self::Portable
+    }
+
+    fn level(self) -> Level {
+        #[cfg(target_arch = "x86_64")]
+        {
+            let best = Level::new();
+            let found = match self {
+                Self::Portable => None,
+                Self::Avx2 => best.as_avx2().map(Level::Avx2),
+                Self::Avx512 => best.as_avx512().map(Level::Avx512),
+            };
+            found.unwrap_or(Level::baseline())
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        Level::baseline()
     }
 }
 
@@ -50,11 +64,7 @@ pub fn chosen() -> Isa {
         1 => Isa::Portable,
         2 => Isa::Avx2,
         3 => Isa::Avx512,
-        _ => {
-            let isa = Isa::detect();
-            CHOSEN.store(isa as u8, Ordering::Relaxed);
-            isa
-        }
+        _ => choose(Isa::detect()),
     }
 }
 
@@ -65,35 +75,14 @@ pub fn choose(isa: Isa) -> Isa {
     isa
 }
 
-/// A piece of work to be compiled for several instruction sets. `run` and all that it calls in its loops must be
-/// `#[inline(always)]`, or they are compiled for the portable set only (slow, never wrong).
+/// A piece of work over vectors. `run` and all that it calls in its loops must be `#[inline(always)]`: what is not inlined
+/// is compiled for the portable instruction set.
 pub trait Work {
     /// Does the work.
-    fn run(self);
+    fn run<S: Simd>(self, simd: S);
 }
 
 /// Runs `work` with the [`chosen`] instruction set.
 pub fn dispatch(work: impl Work) {
-    #[cfg(target_arch = "x86_64")]
-    match chosen() {
-        // SAFETY: `chosen` never exceeds what `Isa::detect` found on this machine.
-        Isa::Avx512 => unsafe { run_avx512(work) },
-        // SAFETY: as above.
-        Isa::Avx2 => unsafe { run_avx2(work) },
-        Isa::Portable => work.run(),
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    work.run();
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq")]
-fn run_avx512(work: impl Work) {
-    work.run();
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn run_avx2(work: impl Work) {
-    work.run();
+    fearless_simd::dispatch!(chosen().level(), simd => work.run(simd));
 }

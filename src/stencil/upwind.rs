@@ -8,7 +8,10 @@
 //! HJ-WENO5 weighs three third-order one-sided differences by their smoothness (Jiang & Peng 2000; Shu's ICASE report
 //! 97-65); fifth order where φ is smooth, and never worse than third order beside a kink.
 
-use super::{Halo, Row, Star};
+use fearless_simd::{Select, Simd, SimdBase};
+
+use super::simd::Lanes;
+use super::{Halo, StarHalo};
 
 /// The one-sided differences in use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -20,52 +23,53 @@ pub enum UpwindScheme {
     HjWeno5,
 }
 
-/// Godunov's |Dφ|² (unscaled) of row (x, y) by first-order differences.
+/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by first-order differences.
 #[inline(always)]
-pub fn godunov_first(halo: &Halo<10>, x: usize, y: usize) -> Row {
-    let star = Star::new(halo, x, y);
-    let centre = star.at(0, 0);
-    let mut out = [0.0; 8];
+pub fn godunov_first<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize) -> Lanes<S> {
+    let centre = halo.rows(simd, x, y, [0; 3]);
+    let mut sum = Lanes::splat(simd, 0.0);
     for axis in 0..3 {
-        let (before, after) = (star.at(axis, -1), star.at(axis, 1));
-        for z in 0..8 {
-            out[z] += godunov(centre[z], centre[z] - before[z], after[z] - centre[z]);
-        }
+        let mut step = [0; 3];
+        step[axis] = 1;
+        let after = halo.rows(simd, x, y, step);
+        let before = halo.rows(simd, x, y, step.map(isize::wrapping_neg));
+        sum += godunov(simd, centre, centre - before, after - centre);
     }
-    out
+    sum
 }
 
-/// Godunov's |Dφ|² (unscaled) of row (x, y) by HJ-WENO5 differences. `epsilon` as for [`weno5`].
+/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by HJ-WENO5 differences.
 #[inline(always)]
-pub fn godunov_weno5(halo: &Halo<14>, x: usize, y: usize, epsilon: WenoEpsilon) -> Row {
-    let star = Star::new(halo, x, y);
-    let centre = star.at(0, 0);
-    let mut out = [0.0; 8];
+pub fn godunov_weno5<S: Simd>(
+    simd: S,
+    halo: &StarHalo,
+    x: usize,
+    y: usize,
+    voxel_size: f32,
+    epsilon: WenoEpsilon,
+) -> Lanes<S> {
+    let scale = 1.0 / (voxel_size * voxel_size);
+    let centre = halo.centre(simd, x, y);
+    let mut sum = Lanes::splat(simd, 0.0);
     for axis in 0..3 {
-        let [m3, m2, m1, p1, p2, p3] = [-3, -2, -1, 1, 2, 3].map(|step| star.at(axis, step));
-        for z in 0..8 {
-            let v1 = m2[z] - m3[z];
-            let v2 = m1[z] - m2[z];
-            let v3 = centre[z] - m1[z];
-            let v4 = p1[z] - centre[z];
-            let v5 = p2[z] - p1[z];
-            let v6 = p3[z] - p2[z];
-            let before = weno5([v1, v2, v3, v4, v5], epsilon);
-            let after = weno5([v6, v5, v4, v3, v2], epsilon);
-            out[z] += godunov(centre[z], before, after);
-        }
+        let [m3, m2, m1, p1, p2, p3] = halo.along(simd, x, y, axis);
+        let (v1, v2, v3) = (m2 - m3, m1 - m2, centre - m1);
+        let (v4, v5, v6) = (p1 - centre, p2 - p1, p3 - p2);
+        let before = weno5(simd, [v1, v2, v3, v4, v5], scale, epsilon);
+        let after = weno5(simd, [v6, v5, v4, v3, v2], scale, epsilon);
+        sum += godunov(simd, centre, before, after);
     }
-    out
+    sum
 }
 
 /// One axis of Godunov's |Dφ|², for a field that grows away from its zero set.
 #[inline(always)]
-fn godunov(phi: f32, before: f32, after: f32) -> f32 {
+fn godunov<S: Simd>(simd: S, phi: Lanes<S>, before: Lanes<S>, after: Lanes<S>) -> Lanes<S> {
+    let zero = Lanes::splat(simd, 0.0);
     // Inside, the mirrored field −φ obeys the outside rule.
-    let sign = if phi > 0.0 { 1.0 } else { -1.0 };
-    let (before, after) = (sign * before, sign * after);
-    let a = before.max(0.0);
-    let b = after.min(0.0);
+    let outside = phi.simd_gt(zero);
+    let a = outside.select(before, -before).max(zero);
+    let b = outside.select(after, -after).min(zero);
     (a * a).max(b * b)
 }
 
@@ -78,64 +82,86 @@ pub struct WenoEpsilon {
 
 impl WenoEpsilon {
     /// ε = 1e-6 · max(v²): the result does not depend on the voxel size.
-    pub const SCALE_FREE: Self = Self { relative: 1e-6, absolute: 1e-18 };
+    pub const SCALE_FREE: Self = Self { relative: 1e-6, absolute: 0.0 };
 
     /// OpenVDB's absolute 1e-8 on unscaled differences: its results depend on the voxel size. For comparisons.
     pub const OPENVDB: Self = Self { relative: 0.0, absolute: 1e-8 };
 }
 
-/// HJ-WENO5 difference from five consecutive first differences, the upwind side first.
+/// The least ε in squared voxel sizes: its fourth power is still a normal f32, so that weights as products stay above zero.
+const LEAST_EPSILON: f32 = 1e-9;
+
+/// HJ-WENO5 difference from five consecutive unscaled first differences, the upwind side first; `scale` is 1/dx².
 #[inline(always)]
-pub fn weno5(v: [f32; 5], epsilon: WenoEpsilon) -> f32 {
-    const C: f32 = 13.0 / 12.0;
-    let [v1, v2, v3, v4, v5] = v;
-    let mut floor = epsilon.absolute;
+pub fn weno5<S: Simd>(simd: S, [v1, v2, v3, v4, v5]: [Lanes<S>; 5], scale: f32, epsilon: WenoEpsilon) -> Lanes<S> {
+    let mut floor = Lanes::splat(simd, (epsilon.absolute * scale).max(LEAST_EPSILON));
     if epsilon.relative > 0.0 {
-        let largest = v.into_iter().fold(0.0f32, |m, d| m.max(d * d));
-        floor += epsilon.relative * largest;
+        let (a, b, c, d, e) = (v1 * v1, v2 * v2, v3 * v3, v4 * v4, v5 * v5);
+        floor = floor.max(a.max(b).max(c.max(d)).max(e) * (epsilon.relative * scale));
     }
-    let smoothness = |second: f32, first: f32| C * (second * second) + 0.25 * (first * first) + floor;
-    let s1 = smoothness(v1 - 2.0 * v2 + v3, v1 - 4.0 * v2 + 3.0 * v3);
-    let s2 = smoothness(v2 - 2.0 * v3 + v4, v2 - v4);
-    let s3 = smoothness(v3 - 2.0 * v4 + v5, 3.0 * v3 - 4.0 * v4 + v5);
-    // Weights relative to the smoothest stencil: they stay within f32 for any voxel size.
-    let least = s1.min(s2).min(s3);
-    let weight = |linear: f32, s: f32| {
-        let r = least / s;
-        linear * (r * r)
-    };
-    let (a1, a2, a3) = (weight(0.1, s1), weight(0.6, s2), weight(0.3, s3));
-    (a1 * (2.0 * v1 - 7.0 * v2 + 11.0 * v3) + a2 * (5.0 * v3 - v2 + 2.0 * v4) + a3 * (2.0 * v3 + 5.0 * v4 - v5))
-        / (6.0 * (a1 + a2 + a3))
+    let s1 = smoothness(v1 - v2 * 2.0 + v3, v1 - v2 * 4.0 + v3 * 3.0, scale, floor);
+    let s2 = smoothness(v2 - v3 * 2.0 + v4, v2 - v4, scale, floor);
+    let s3 = smoothness(v3 - v4 * 2.0 + v5, v3 * 3.0 - v4 * 4.0 + v5, scale, floor);
+    // The weights γ/s² times (s₁s₂s₃)²: products instead of three quotients.
+    let (p1, p2, p3) = (s2 * s3, s1 * s3, s1 * s2);
+    let (a1, a2, a3) = (p1 * p1 * 0.1, p2 * p2 * 0.6, p3 * p3 * 0.3);
+    (a1 * (v1 * 2.0 - v2 * 7.0 + v3 * 11.0) + a2 * (v3 * 5.0 - v2 + v4 * 2.0) + a3 * (v3 * 2.0 + v4 * 5.0 - v5))
+        / ((a1 + a2 + a3) * 6.0)
+}
+
+/// Smoothness of a third-order stencil in squared voxel sizes: large beside a kink.
+#[inline(always)]
+fn smoothness<S: Simd>(second: Lanes<S>, first: Lanes<S>, scale: f32, floor: Lanes<S>) -> Lanes<S> {
+    second * second * (13.0 / 12.0 * scale) + first * first * (0.25 * scale) + floor
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::stencil::simd::{Work, dispatch};
+
+    /// Runs a kernel on equal lanes and hands over the first.
+    fn lane(f: impl FnOnce(&mut dyn FnMut([f32; 5], WenoEpsilon) -> f32, &mut dyn FnMut([f32; 3]) -> f32)) {
+        struct Run<F>(F);
+        impl<F: FnOnce(&mut dyn FnMut([f32; 5], WenoEpsilon) -> f32, &mut dyn FnMut([f32; 3]) -> f32)> Work for Run<F> {
+            fn run<S: Simd>(self, simd: S) {
+                let splat = |v: f32| Lanes::splat(simd, v);
+                self.0(&mut |v, e| weno5(simd, v.map(splat), 1.0, e)[0], &mut |[p, b, a]| {
+                    godunov(simd, splat(p), splat(b), splat(a))[0]
+                });
+            }
+        }
+        dispatch(Run(f));
+    }
 
     #[test]
     fn weno5_is_fifth_order_on_smooth_data_and_exact_on_lines() {
-        for epsilon in [WenoEpsilon::SCALE_FREE, WenoEpsilon::OPENVDB] {
-            assert!((weno5([0.3; 5], epsilon) - 0.3).abs() < 1e-7);
-        }
-        assert_eq!(weno5([0.0; 5], WenoEpsilon::SCALE_FREE), 0.0);
-        // First differences of sin at spacing h; the derivative at the point between the third and the fourth is cos.
-        let error = |h: f64| {
-            let f = |k: f64| (0.4 + k * h).sin();
-            let v = [-3.0, -2.0, -1.0, 0.0, 1.0].map(|k| ((f(k + 1.0) - f(k)) / h) as f32);
-            (f64::from(weno5(v, WenoEpsilon::SCALE_FREE)) - 0.4f64.cos()).abs()
-        };
-        // Halving h from 0.4 divides a fifth-order error by 32; rounding of f32 allows no finer spacing.
-        assert!(error(0.4) < 0.4f64.powi(5) / 20.0 && error(0.2) < error(0.4) / 16.0, "{} {}", error(0.4), error(0.2));
+        lane(|weno5, _| {
+            for epsilon in [WenoEpsilon::SCALE_FREE, WenoEpsilon::OPENVDB] {
+                assert!((weno5([0.3; 5], epsilon) - 0.3).abs() < 1e-7);
+            }
+            assert_eq!(weno5([0.0; 5], WenoEpsilon::SCALE_FREE), 0.0);
+            // First differences of sin at spacing h; the derivative at the point between the third and the fourth is cos.
+            let mut error = |h: f64| {
+                let f = |k: f64| (0.4 + k * h).sin();
+                let v = [-3.0, -2.0, -1.0, 0.0, 1.0].map(|k| ((f(k + 1.0) - f(k)) / h) as f32);
+                (f64::from(weno5(v, WenoEpsilon::SCALE_FREE)) - 0.4f64.cos()).abs()
+            };
+            // Halving h from 0.4 divides a fifth-order error by 32; rounding of f32 allows no finer spacing.
+            let (coarse, fine) = (error(0.4), error(0.2));
+            assert!(coarse < 0.4f64.powi(5) / 20.0 && fine < coarse / 16.0, "{coarse} {fine}");
+        });
     }
 
     #[test]
     fn godunov_looks_towards_the_surface() {
-        // Outside a surface to the left: the difference behind counts, the one ahead does not.
-        assert_eq!(godunov(1.0, 0.5, 0.7), 0.25);
-        assert_eq!(godunov(-1.0, 0.5, 0.7), 0.7 * 0.7);
-        // A ridge takes nothing, a valley the steeper side.
-        assert_eq!(godunov(1.0, -0.5, 0.7), 0.0);
-        assert_eq!(godunov(1.0, 0.5, -0.7), 0.7 * 0.7);
+        lane(|_, godunov| {
+            // Outside a surface to the left: the difference behind counts, the one ahead does not.
+            assert_eq!(godunov([1.0, 0.5, 0.7]), 0.25);
+            assert_eq!(godunov([-1.0, 0.5, 0.7]), 0.7 * 0.7);
+            // A ridge takes nothing, a valley the steeper side.
+            assert_eq!(godunov([1.0, -0.5, 0.7]), 0.0);
+            assert_eq!(godunov([1.0, 0.5, -0.7]), 0.7 * 0.7);
+        });
     }
 }

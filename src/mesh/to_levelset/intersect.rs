@@ -3,14 +3,14 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::Bvh;
+use crate::mesh::Bvh;
 
 /// Triangles nearer than this (voxels) touch: rounding must not hide that two coincide.
 const TOUCH: f64 = 1e-3;
 
 /// Marks the triangles that another one crosses, overlaps or touches otherwise than at the vertices that they share.
 /// `bvh` holds the triangles of the indexed mesh in its order. Neighbours over an edge are not looked at.
-pub(crate) fn intersecting(bvh: &Bvh, positions: &[DVec3], triangles: &[[u32; 3]]) -> Vec<bool> {
+pub(super) fn intersecting(bvh: &Bvh, positions: &[DVec3], triangles: &[[u32; 3]]) -> Vec<bool> {
     let corners = |t: u32| triangles[t as usize].map(|v| positions[v as usize]);
     (0..triangles.len() as u32)
         .into_par_iter()

@@ -9,19 +9,17 @@ use std::f64::consts::PI;
 
 use glam::{DVec3, IVec3};
 
-use super::WindingNumber;
 use super::crossings::Crossings;
-use super::topology::{boundary_chain, edge_uses};
-use super::winding::BATCH;
-use crate::grid::{Face, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset, leaf_origin, offset_to_local};
+use crate::grid::{Face, LEAF_DIM, LeafMask, LeafValues, leaf_offset};
+use crate::mesh::WindingNumber;
+use crate::mesh::topology::{boundary_chain, edge_uses};
+use crate::mesh::winding::BATCH;
 
-/// Half the diagonal of the lattice of a leaf's voxels, 3.5·√3, rounded up.
-const LEAF_RADIUS: f64 = 6.1;
 /// The error of fast winding numbers, doubled.
-pub(crate) const WINDING_ERROR: f64 = 0.02;
+pub(super) const WINDING_ERROR: f64 = 0.02;
 /// Neighbouring voxels whose distances to the triangles add up to more than their own distance are not separated.
 /// The excess covers the rounding of the distances.
-pub(crate) const APART: f32 = 1.0 + 1e-5;
+pub(super) const APART: f32 = 1.0 + 1e-5;
 
 /// Edges in a group of the rim.
 const RIM_GROUP: usize = 32;
@@ -35,7 +33,7 @@ struct Current {
 }
 
 /// The boundary of a mesh, and how fast the winding number can change because of it.
-pub(crate) struct Rim {
+pub(super) struct Rim {
     groups: Vec<(Current, Vec<Current>)>,
 }
 
@@ -60,6 +58,11 @@ impl Rim {
         Self { groups: groups.collect() }
     }
 
+    /// Whether there is no boundary.
+    pub fn is_empty(&self) -> bool {
+        self.groups.is_empty()
+    }
+
     /// A bound of |∇w| away from triangles in the ball around `center`; `None` if it exceeds `useless`.
     pub fn steepest(&self, center: DVec3, radius: f64, useless: f64) -> Option<f64> {
         let slope = |current: &Current| {
@@ -79,7 +82,7 @@ impl Rim {
 }
 
 /// Tells inside from outside, leaf by leaf.
-pub(crate) enum Inside<'a> {
+pub(super) enum Inside<'a> {
     /// Of a mesh without boundary: where the integer winding number is positive.
     Closed(Crossings),
     /// Of any mesh.
@@ -97,63 +100,96 @@ impl Inside<'_> {
 }
 
 /// Inside by winding number.
-pub(crate) struct OpenInside<'a> {
+pub(super) struct OpenInside<'a> {
     pub winding: &'a WindingNumber<'a>,
     pub rim: &'a Rim,
 }
 
 impl OpenInside<'_> {
     fn leaf(&self, origin: IVec3, distance: Option<&LeafValues>) -> LeafMask {
-        self.by_seeds(origin, distance).unwrap_or_else(|| self.by_voxels(origin))
-    }
-
-    fn by_voxels(&self, origin: IVec3) -> LeafMask {
-        let mut mask = LeafMask::EMPTY;
-        for row in 0..LEAF_VOXELS / BATCH {
-            let points = std::array::from_fn(|z| (origin + offset_to_local(row * BATCH + z)).as_dvec3());
-            let w = self.winding.at_each::<BATCH>(&points);
-            w.iter().enumerate().for_each(|(z, w)| mask.set(row * BATCH + z, *w > 0.5));
-        }
-        mask
-    }
-
-    /// The mask from one voxel of each set of unseparated voxels, or `None` where that proves nothing.
-    fn by_seeds(&self, origin: IVec3, distance: Option<&LeafValues>) -> Option<LeafMask> {
-        /// With this slope w changes by ½ within the leaf.
-        const USELESS: f64 = 0.5 / (2.0 * LEAF_RADIUS);
-        let slope = self.rim.steepest(origin.as_dvec3() + 3.5, LEAF_RADIUS, USELESS)?;
-        let mut known = LeafMask::EMPTY;
         let mut inside = LeafMask::EMPTY;
+        if !self.by_seeds(Block { origin, start: IVec3::ZERO, edge: LEAF_DIM }, distance, &mut inside) {
+            // Half the size has half the variation, and mostly less of the boundary near.
+            for octant in blocks(LEAF_DIM / 2) {
+                let block = Block { origin, start: octant, edge: LEAF_DIM / 2 };
+                if !self.by_seeds(block, distance, &mut inside) {
+                    self.by_voxels(block, &mut inside);
+                }
+            }
+        }
+        inside
+    }
+
+    /// Asks for every voxel of a block.
+    fn by_voxels(&self, block: Block, inside: &mut LeafMask) {
+        for start in blocks(2).map(|start| block.start + start).filter(|s| block.holds(*s)) {
+            let voxels: [IVec3; BATCH] = std::array::from_fn(|i| start + offset_in(i as i32, 2));
+            let w = self.winding.at_each::<BATCH>(&voxels.map(|v| (block.origin + v).as_dvec3()));
+            voxels.iter().zip(w).for_each(|(v, w)| inside.set(leaf_offset(*v), w > 0.5));
+        }
+    }
+
+    /// Asks for one voxel of each set of unseparated voxels of a block. Returns false where that proves nothing.
+    fn by_seeds(&self, block: Block, distance: Option<&LeafValues>, inside: &mut LeafMask) -> bool {
+        // Half the diagonal of the lattice of the block's voxels, √3/2 · (edge − 1), rounded up.
+        let radius = 0.87 * f64::from(block.edge - 1);
+        let center = (block.origin + block.start).as_dvec3() + 0.5 * f64::from(block.edge - 1);
+        // With half a turn of w over the block's diameter every value is possible.
+        let Some(slope) = self.rim.steepest(center, radius, 0.25 / radius) else { return false };
+        let mut known = LeafMask::EMPTY;
         let mut open = Vec::new();
-        for seed in 0..LEAF_VOXELS {
-            if known.get(seed) {
+        for seed in (0..block.edge.pow(3)).map(|i| block.start + offset_in(i, block.edge)) {
+            if known.get(leaf_offset(seed)) {
                 continue;
             }
-            let w = self.winding.at((origin + offset_to_local(seed)).as_dvec3());
+            let w = self.winding.at((block.origin + seed).as_dvec3());
             let from_half = (w - w.floor() - 0.5).abs();
-            if from_half <= WINDING_ERROR + slope * 2.0 * LEAF_RADIUS {
-                return None;
+            if from_half <= WINDING_ERROR + slope * 2.0 * radius {
+                return false;
             }
-            known.set(seed, true);
+            known.set(leaf_offset(seed), true);
             open.push(seed);
-            while let Some(offset) = open.pop() {
-                inside.set(offset, w > 0.5);
-                let local = offset_to_local(offset);
-                for face in Face::ALL {
-                    let next = local + face.step();
-                    if leaf_origin(next) != IVec3::ZERO || known.get(leaf_offset(next)) {
+            while let Some(voxel) = open.pop() {
+                inside.set(leaf_offset(voxel), w > 0.5);
+                for next in Face::ALL.map(|face| voxel + face.step()) {
+                    if !block.holds(next) || known.get(leaf_offset(next)) {
                         continue;
                     }
-                    let next = leaf_offset(next);
-                    if distance.is_none_or(|d| d.0[offset] + d.0[next] > APART) {
-                        known.set(next, true);
+                    if distance.is_none_or(|d| d.0[leaf_offset(voxel)] + d.0[leaf_offset(next)] > APART) {
+                        known.set(leaf_offset(next), true);
                         open.push(next);
                     }
                 }
             }
         }
-        Some(inside)
+        true
     }
+}
+
+/// A cube of voxels in the leaf at `origin`.
+#[derive(Clone, Copy)]
+struct Block {
+    origin: IVec3,
+    /// Its first voxel, in the leaf.
+    start: IVec3,
+    edge: i32,
+}
+
+impl Block {
+    fn holds(&self, voxel: IVec3) -> bool {
+        voxel.cmpge(self.start).all() && voxel.cmplt(self.start + self.edge).all()
+    }
+}
+
+/// The first voxels of the cubes of `edge` that make up a leaf.
+fn blocks(edge: i32) -> impl Iterator<Item = IVec3> {
+    let count = LEAF_DIM / edge;
+    (0..count.pow(3)).map(move |i| offset_in(i, count) * edge)
+}
+
+/// The voxel number `i` of a cube.
+fn offset_in(i: i32, edge: i32) -> IVec3 {
+    IVec3::new(i / edge / edge, i / edge % edge, i % edge)
 }
 
 #[cfg(test)]
@@ -177,10 +213,12 @@ mod tests {
         let leaves = distance_to_triangles(triangles.len(), |t| triangles[t], 3.0, &RunOptions::default()).unwrap();
         let mut seeded = 0;
         for leaf in leaves.iter().step_by(7) {
-            if let Some(mask) = open.by_seeds(leaf.origin, Some(&leaf.distance)) {
+            let block = Block { origin: leaf.origin, start: IVec3::ZERO, edge: LEAF_DIM };
+            let (mut mask, mut by_voxels) = (LeafMask::EMPTY, LeafMask::EMPTY);
+            if open.by_seeds(block, Some(&leaf.distance), &mut mask) {
                 seeded += 1;
-                let by_voxels = open.by_voxels(leaf.origin);
-                for o in 0..LEAF_VOXELS {
+                open.by_voxels(block, &mut by_voxels);
+                for o in 0..crate::grid::LEAF_VOXELS {
                     assert!(leaf.distance.0[o] < 1e-3 || mask.get(o) == by_voxels.get(o), "{} {o}", leaf.origin);
                 }
             }

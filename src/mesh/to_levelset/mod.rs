@@ -1,20 +1,27 @@
 //! Triangle mesh → narrow-band level set.
 //!
-//! The mesh is cleaned and oriented ([`prepare`](super::prepare)); distances are exact to its triangles. The sign of a closed mesh is that
+//! The mesh is cleaned and oriented ([`prepare`]); distances are exact to its triangles. The sign of a closed mesh is that
 //! of its integer winding number: inside where it is 1 or more, so that overlapping shells are united and shells that
 //! face inwards within others are cavities. Any other mesh is inside where its generalised winding number is above ½.
 //!
 //! Where shells overlap or the mesh is open, distances are to the *repaired* surface: pieces of triangles with the same inside or
-//! outside on both sides are left out ([`pieces`](super::pieces)), and the ½ level of the winding number is put in where the sign changes
-//! without a triangle ([`closure`](super::closure)). So the result is a valid level set whatever came in, and [`MeshFindings`] says what was done.
+//! outside on both sides are left out (`pieces`), and the ½ level of the winding number is put in where the sign changes
+//! without a triangle (`closure`). So the result is a valid level set whatever came in, and [`MeshFindings`] says what was done.
+
+mod closure;
+mod crossings;
+mod inside;
+mod intersect;
+mod pieces;
 
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::closure::{DistanceLeaves, Surroundings};
-use super::crossings::Crossings;
-use super::inside::{Inside, OpenInside, Rim};
-use super::pieces::separating_pieces;
+use closure::{DistanceLeaves, Surroundings};
+use crossings::Crossings;
+use inside::{Inside, OpenInside, Rim};
+use pieces::separating_pieces;
+
 use super::prepare::prepare;
 use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes};
 use super::topology::{boundary_chain, edge_uses};
@@ -75,11 +82,12 @@ pub fn mesh_to_level_set(
 ) -> Result<(LevelSet, MeshFindings)> {
     check_numbers(mesh)?;
     params.validate()?;
+    check_range(mesh, params)?;
     let (mut clean, mut findings) = prepare(mesh);
     if clean.triangles.is_empty() {
         return Err(nothing_left(mesh, &findings));
     }
-    to_index_space(&mut clean, params)?;
+    clean.positions.iter_mut().for_each(|p| *p /= params.voxel_size);
     reserve(&clean, params, run)?;
     run.check(OPERATION)?;
 
@@ -101,7 +109,7 @@ pub fn mesh_to_level_set(
     };
     let level_set = LevelSet::new(grid_of_leaves(background(params.half_width, &transform), leaves), transform);
     if !encloses_a_voxel(&level_set) {
-        return Err(encloses_nothing(&findings, params));
+        return Err(encloses_nothing(closed, &findings, params));
     }
     Ok((level_set, findings))
 }
@@ -124,11 +132,9 @@ fn repair(
         None => Inside::Open(OpenInside { winding: &winding, rim: &rim }),
     };
     run.check(OPERATION)?;
-    let t0 = std::time::Instant::now();
-    let pieces = separating_pieces(&clean.positions, &clean.triangles, &bvh, &winding, &rim);
+    let pieces = separating_pieces(&clean.positions, &clean.triangles, &bvh, &winding, &rim, run)?;
     findings.removed_area_fraction = pieces.removed_area_fraction;
     run.check(OPERATION)?;
-    println!("  pieces {:?} kept {}", t0.elapsed(), pieces.kept.len());
     let all = DistanceLeaves::new(distances);
     let kept = if pieces.removed_area_fraction > 0.0 {
         distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?
@@ -138,7 +144,6 @@ fn repair(
     let mut kept = DistanceLeaves::new(kept);
     let mut surroundings = Surroundings::new(&inside, &winding, &all);
     let closure = surroundings.close(&kept, half_width, run)?;
-    println!("  close {:?}", t0.elapsed());
     findings.closure_triangles = closure.len();
     kept.merge(distance_to_triangles(closure.len(), |t| closure[t], half_width, run)?);
     let unsigned: Vec<_> = kept.origins().filter(|o| surroundings.mask(*o).is_none()).collect();
@@ -202,8 +207,8 @@ fn check_numbers(mesh: &TriangleMesh) -> Result<()> {
     Ok(())
 }
 
-/// Divides the positions by the voxel size, if index space has room for them.
-fn to_index_space(mesh: &mut TriangleMesh, params: &MeshToLevelSet) -> Result<()> {
+/// Refuses coordinates for which index space has no room.
+fn check_range(mesh: &TriangleMesh, params: &MeshToLevelSet) -> Result<()> {
     let Some((lo, hi)) = mesh.bounding_box() else { return Ok(()) };
     let room = f64::from(MAX_COORD) - f64::from(params.half_width) - 64.0;
     let largest = lo.abs().max(hi.abs()).max_element();
@@ -214,7 +219,6 @@ fn to_index_space(mesh: &mut TriangleMesh, params: &MeshToLevelSet) -> Result<()
         );
         return Err(EditError::parameter(OPERATION, "voxel_size", params.voxel_size, accepted));
     }
-    mesh.positions.iter_mut().for_each(|p| *p /= params.voxel_size);
     Ok(())
 }
 
@@ -261,8 +265,8 @@ fn nothing_left(mesh: &TriangleMesh, findings: &MeshFindings) -> EditError {
 }
 
 /// The error for a surface without a voxel inside.
-fn encloses_nothing(findings: &MeshFindings, params: &MeshToLevelSet) -> EditError {
-    if findings.converted.closed {
+fn encloses_nothing(closed: bool, findings: &MeshFindings, params: &MeshToLevelSet) -> EditError {
+    if closed {
         let accepted = "every part of the mesh is thinner than a voxel, so that no voxel is inside; take a smaller one";
         return EditError::parameter(OPERATION, "voxel_size", params.voxel_size, accepted);
     }
@@ -275,188 +279,4 @@ fn encloses_nothing(findings: &MeshFindings, params: &MeshToLevelSet) -> EditErr
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::grid::{Face, LEAF_VOXELS, offset_to_local};
-    use crate::mesh::testing::*;
-
-    fn convert(mesh: &TriangleMesh, voxel_size: f64) -> Result<(LevelSet, MeshFindings)> {
-        mesh_to_level_set(mesh, &MeshToLevelSet::new(voxel_size), &RunOptions::default())
-    }
-
-    /// The promises of a level set that the conversion has to keep, and the volume inside in world units.
-    fn check_valid(level_set: &LevelSet) -> f64 {
-        let grid = level_set.grid();
-        let background = grid.background();
-        let mut voxels = 0usize;
-        for &id in grid.leaves() {
-            let (origin, values, mask) = (grid.origin(id), grid.values(id), grid.mask(id));
-            for offset in 0..LEAF_VOXELS {
-                let (v, ijk) = (values.0[offset], origin + offset_to_local(offset));
-                assert_eq!(mask.get(offset), v.abs() < background, "{ijk}: {v}");
-                assert!(v.abs() <= background);
-                voxels += usize::from(v < 0.0);
-                for face in Face::ALL {
-                    let (other, active) = grid.voxel(ijk + face.step());
-                    let differ = (v < 0.0) != (other < 0.0);
-                    assert!(!differ || active && mask.get(offset), "{ijk} {face:?}: {v} and {other}");
-                    // Distances change by no more than the distance of the voxels.
-                    assert!(
-                        (v - other).abs() as f64 <= level_set.voxel_size() * 1.001,
-                        "{ijk} {face:?}: {v} and {other}"
-                    );
-                }
-            }
-        }
-        voxels += grid.inside_tiles().iter().map(|(_, edge)| (*edge as usize).pow(3)).sum::<usize>();
-        voxels as f64 * level_set.voxel_size().powi(3)
-    }
-
-    fn value(level_set: &LevelSet, xyz: DVec3) -> f64 {
-        let ijk = level_set.transform().world_to_index(xyz).round().as_ivec3();
-        f64::from(level_set.grid().voxel(ijk).0)
-    }
-
-    #[test]
-    fn a_box_is_exact() {
-        let (level_set, findings) = convert(&cube(DVec3::new(-0.53, 0.21, 0.07), 1.13), 0.05).unwrap();
-        assert!(findings.is_sound());
-        check_valid(&level_set);
-        let grid = level_set.grid();
-        let (center, half) = (DVec3::new(-0.53, 0.21, 0.07) + 1.13 / 2.0, 1.13 / 2.0);
-        for &id in grid.leaves() {
-            for offset in grid.mask(id).iter() {
-                let q = (level_set.transform().voxel_to_world(grid.origin(id) + offset_to_local(offset)) - center)
-                    .abs()
-                    - half;
-                let truth = q.max(DVec3::ZERO).length() + q.max_element().min(0.0);
-                assert!((f64::from(grid.values(id).0[offset]) - truth).abs() < 1e-5 * 0.05);
-            }
-        }
-    }
-
-    #[test]
-    fn a_torus_of_triangles_is_exact_to_its_triangles() {
-        let Some(mesh) = shared_mesh("meshes/torus.obj") else { return };
-        let (level_set, findings) = convert(&mesh, 0.02).unwrap();
-        assert!(findings.is_sound());
-        let volume = check_valid(&level_set);
-        assert!((volume / analyze_volume(&mesh) - 1.0).abs() < 0.01);
-        let bvh = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect());
-        let grid = level_set.grid();
-        for &id in grid.leaves().iter().step_by(5) {
-            for offset in grid.mask(id).iter() {
-                let xyz = level_set.transform().voxel_to_world(grid.origin(id) + offset_to_local(offset));
-                let truth = bvh.closest_point(xyz, 1.0).unwrap().distance_squared.sqrt();
-                assert!((f64::from(grid.values(id).0[offset].abs()) - truth).abs() < 1e-5 * 0.02);
-            }
-        }
-    }
-
-    fn analyze_volume(mesh: &TriangleMesh) -> f64 {
-        crate::mesh::analyze(mesh).signed_volume
-    }
-
-    #[test]
-    fn overlapping_shells_are_united_and_their_inner_walls_vanish() {
-        let mesh = joined(cube(DVec3::splat(0.01), 1.0), &cube(DVec3::new(0.51, 0.01, 0.01), 1.0));
-        let (level_set, findings) = convert(&mesh, 0.04).unwrap();
-        assert!(findings.self_intersecting && !findings.is_sound());
-        let volume = check_valid(&level_set);
-        assert!((volume - 1.5).abs() < 0.05, "{volume}");
-        // In the middle of the overlap the walls at x = 0.51 and x = 1.01 are gone.
-        assert_eq!(value(&level_set, DVec3::new(0.52, 0.5, 0.5)), -f64::from(level_set.background()));
-        assert_eq!(value(&level_set, DVec3::new(1.0, 0.5, 0.5)), -f64::from(level_set.background()));
-        let strict = MeshToLevelSet { strict: true, ..MeshToLevelSet::new(0.04) };
-        let error = mesh_to_level_set(&mesh, &strict, &RunOptions::default()).err().unwrap();
-        assert!(error.exit_code() == 3 && error.to_string().contains("pass through"), "{error}");
-    }
-
-    #[test]
-    fn cavities_stay_and_inside_out_is_turned() {
-        let hollow = joined(cube(DVec3::splat(0.01), 1.0), &reversed(cube(DVec3::splat(0.31), 0.4)));
-        for mesh in [hollow.clone(), reversed(hollow)] {
-            let (level_set, findings) = convert(&mesh, 0.04).unwrap();
-            let volume = check_valid(&level_set);
-            assert!((volume - (1.0 - 0.064)).abs() < 0.03, "{volume}");
-            assert_eq!(findings.cavities, 1);
-            assert!(value(&level_set, DVec3::splat(0.5)) > 0.0);
-        }
-    }
-
-    #[test]
-    fn an_open_sphere_is_closed_smoothly() {
-        let mut mesh = sphere(DVec3::splat(0.013), 1.0, 60);
-        // The cap within 30 degrees of the north pole is missing.
-        mesh.triangles.retain(|t| t.iter().any(|&v| mesh.positions[v as usize].z < 0.87));
-        let (level_set, findings) = convert(&mesh, 0.05).unwrap();
-        let volume = check_valid(&level_set);
-        // Between the sphere without its cap (the plane lid) and the whole sphere.
-        let cap = std::f64::consts::PI * 0.134f64.powi(2) * (3.0 - 0.134) / 3.0;
-        let whole = 4.0 / 3.0 * std::f64::consts::PI;
-        assert!(volume < whole && volume > whole - 2.0 * cap, "{volume} of {whole}");
-        assert!(findings.converted.boundary_edges > 0 && findings.closure_triangles > 0);
-        // Away from the hole nothing is different.
-        assert!((value(&level_set, DVec3::new(0.013, 0.013, -0.9)) + 0.087).abs() < 0.03);
-        assert!(!findings.warnings().is_empty());
-    }
-
-    #[test]
-    fn what_encloses_nothing_is_refused_with_a_reason() {
-        let quad = cube(DVec3::ZERO, 1.0);
-        let sheet = TriangleMesh { triangles: quad.triangles[..2].to_vec(), ..quad.clone() };
-        let both = joined(sheet.clone(), &reversed(sheet.clone()));
-        let empty = TriangleMesh::default();
-        let mut nan = quad.clone();
-        nan.positions[3].y = f64::NAN;
-        let mut index = quad.clone();
-        index.triangles[5][1] = 99;
-        let cases =
-            [(sheet, "open"), (both, "back to back"), (empty, "no triangles"), (nan, "vertex 3"), (index, "vertex 99")];
-        for (mesh, word) in cases {
-            let error = convert(&mesh, 0.1).err().unwrap();
-            assert!(error.exit_code() == 3 && error.to_string().contains(word), "{error}");
-        }
-        let far = cube(DVec3::splat(1e30), 1e30);
-        for (mesh, voxel_size) in [(&far, 1.0), (&quad, 0.0), (&quad, f64::NAN), (&quad, -1.0), (&quad, 50.0)] {
-            let error = convert(mesh, voxel_size).err().unwrap();
-            assert_eq!(error.exit_code(), 2, "{error}");
-        }
-        let mut run = RunOptions::default();
-        run.memory_limit = Some(1 << 20);
-        let error = mesh_to_level_set(&quad, &MeshToLevelSet::new(1e-4), &run).err().unwrap();
-        assert_eq!(error.exit_code(), 5, "{error}");
-    }
-
-    #[test]
-    #[ignore]
-    fn survey() {
-        for file in std::env::var("SURVEY").unwrap().split(',') {
-            let Some(mesh) = shared_mesh(file) else { continue };
-            let (lo, hi) = mesh.bounding_box().unwrap();
-            let n: f64 = std::env::var("RES").map_or(128.0, |r| r.parse().unwrap());
-            let start = std::time::Instant::now();
-            match convert(&mesh, (hi - lo).max_element() / n) {
-                Err(e) => println!("{file}: ERROR {e}"),
-                Ok((ls, f)) => {
-                    let t = start.elapsed();
-                    println!(
-                        "{file}: {t:?} leaves {} active {} closure {} removed {:.4} si {} {:?}",
-                        ls.grid().leaves().len(),
-                        ls.grid().active_voxels(),
-                        f.closure_triangles,
-                        f.removed_area_fraction,
-                        f.self_intersecting,
-                        f.warnings()
-                    );
-                    let v = std::panic::catch_unwind(|| check_valid(&ls));
-                    println!(
-                        "     volume {v:?} mesh {}",
-                        f.converted.signed_volume
-                            * ((hi - lo).max_element() / n).powi(if std::env::var("X").is_ok() { 3 } else { 0 })
-                    );
-                }
-            }
-        }
-    }
-}
+mod tests;

@@ -35,7 +35,7 @@ struct Tile {
 }
 
 /// The crossings of all rows in z with a closed mesh.
-pub(crate) struct Crossings {
+pub(super) struct Crossings {
     tiles: Vec<Tile>,
 }
 

@@ -11,18 +11,18 @@ use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::WindingNumber;
 use super::inside::{APART, Inside};
-use super::scatter::UnsignedLeaf;
 use crate::error::Result;
 use crate::grid::{LEAF_DIM, LeafMask, LeafValues, leaf_offset, leaf_origin};
+use crate::mesh::WindingNumber;
+use crate::mesh::scatter::UnsignedLeaf;
 use crate::run::RunOptions;
 
 const AXES: [IVec3; 3] = [IVec3::X, IVec3::Y, IVec3::Z];
 
 /// Leaves of distances, found by origin.
 #[derive(Default)]
-pub(crate) struct DistanceLeaves {
+pub(super) struct DistanceLeaves {
     leaves: Vec<UnsignedLeaf>,
     index: FxHashMap<IVec3, usize>,
 }
@@ -67,7 +67,7 @@ impl DistanceLeaves {
 }
 
 /// The signs of a surface's surroundings, extended as far as they are asked for.
-pub(crate) struct Surroundings<'a> {
+pub(super) struct Surroundings<'a> {
     inside: &'a Inside<'a>,
     winding: &'a WindingNumber<'a>,
     /// Distances to all triangles of the mesh.
