@@ -117,7 +117,7 @@ fn folder_of(target: &Path) -> &Path {
 }
 
 /// The file behind a chain of symbolic links; it need not exist yet.
-fn final_target(path: &Path) -> Result<PathBuf> {
+pub(crate) fn final_target(path: &Path) -> Result<PathBuf> {
     if path.file_name().is_none() {
         return Err(EditError::output(path, "it is a folder, not a file"));
     }

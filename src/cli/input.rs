@@ -6,7 +6,7 @@ use clap::ArgMatches;
 use glam::DVec3;
 use serde_json::Value;
 
-use super::args;
+use super::{args, table};
 use super::context::Context;
 use super::volume::{self, BandState, Choice, Volume, VolumeGrid};
 use crate::error::{EditError, Result};
@@ -283,7 +283,33 @@ fn convert(
         error => error,
     })?;
     warnings.extend(findings.warnings().into_iter().map(|w| format!("{}: {w}", path.display())));
+    // Where the mesh was repaired, its own volume says nothing.
+    if findings.is_sound() && findings.duplicates_dropped == 0 {
+        let (wanted, has) = (enclosed_volume(mesh), level_set.measure(&context.run)?.volume);
+        if (has - wanted).abs() > LOST * wanted.abs() {
+            warnings.push(format!(
+                "{}: the level set has {} % of the mesh's volume: parts or walls thinner than a voxel are lost; take a voxel size smaller than {:e}",
+                path.display(),
+                table::number(100.0 * has / wanted.abs()),
+                conversion.voxel_size
+            ));
+        }
+    }
     Ok(level_set)
+}
+
+/// Part of a mesh's volume that may be missing unsaid: more than the rounded corners of anything a few voxels thick.
+const LOST: f64 = 0.1;
+
+/// The volume that a closed mesh encloses, by the divergence theorem.
+fn enclosed_volume(mesh: &TriangleMesh) -> f64 {
+    let Some((lo, hi)) = mesh.bounding_box() else { return 0.0 };
+    let centre = (lo + hi) / 2.0;
+    let tetrahedron = |t| {
+        let [a, b, c] = mesh.corners(t).map(|p| p - centre);
+        a.dot(b.cross(c)) / 6.0
+    };
+    (0..mesh.triangles.len()).map(tetrahedron).sum()
 }
 
 /// The level set of a grid as it was read, made valid where that is harmless or asked for, refused where it is no level set.

@@ -7,6 +7,7 @@ use clap::ArgMatches;
 use super::context::Context;
 use super::volume::{self, Volume};
 use super::{args, input};
+use crate::atomic;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{self, MeshFormat, level_set_to_mesh};
@@ -130,7 +131,7 @@ pub fn writable(path: &Path) -> Result<()> {
         _ => {}
     }
     // Through links: the file that they name is the one that is replaced.
-    let real = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_path_buf());
+    let real = atomic::final_target(path)?;
     let folder = match real.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),

@@ -25,7 +25,7 @@ pub use leaf_set::LeafSet;
 pub use paged::{LeafId, PAGE_LEAVES, PageLeaves, Paged};
 use topology::Topology;
 pub use topology::{Neighbours, neighbour_index};
-pub use transform::Transform;
+pub use transform::{Transform, VOXEL_SIZES};
 
 /// Largest index coordinate of a voxel, either sign: beyond it the arithmetic of neighbours could overflow.
 pub const MAX_COORD: i32 = 1 << 30;

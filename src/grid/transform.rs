@@ -6,6 +6,10 @@ use glam::{DAffine3, DMat3, DVec3, IVec3};
 /// Files store matrices in f64; products of a few rotations stay below 1e-12, and a real anisotropy is never this small.
 const UNIFORM_TOLERANCE: f64 = 1e-7;
 
+/// Edges of a voxel, in world units, between which the products of distances in f32 neither vanish nor overflow (WENO5 and the
+/// curvature go up to the fourth power of a distance times small numbers).
+pub const VOXEL_SIZES: std::ops::RangeInclusive<f64> = 1e-9..=1e9;
+
 /// The placement of a grid in the world: `xyz = linear · ijk + translation`, voxels cubic with edge [`voxel_size`](Self::voxel_size).
 ///
 /// Voxel values sit at integer `ijk`. Mirrored transforms (negative determinant) are uniform too.
@@ -31,6 +35,10 @@ impl Transform {
         let mean = (sizes[0] + sizes[1] + sizes[2]) / 3.0;
         if !(mean.is_finite() && mean > 0.0 && to_world.translation.is_finite()) {
             return Err("its transform is not invertible".into());
+        }
+        if !VOXEL_SIZES.contains(&mean) {
+            let (least, most) = (VOXEL_SIZES.start(), VOXEL_SIZES.end());
+            return Err(format!("its voxels of {mean:e} world units are not between {least:e} and {most:e}"));
         }
         if sizes.iter().any(|s| (s - mean).abs() > UNIFORM_TOLERANCE * mean) {
             return Err(format!("its voxels are not cubes ({} x {} x {})", sizes[0], sizes[1], sizes[2]));
@@ -99,5 +107,8 @@ mod tests {
         sheared.matrix3.y_axis = DVec3::new(0.5, 0.75f64.sqrt(), 0.0);
         assert!(Transform::from_affine(sheared).unwrap_err().contains("sheared"));
         assert!(Transform::from_affine(DAffine3::from_scale(DVec3::ZERO)).is_err());
+        for size in [1e-20, 1e20] {
+            assert!(Transform::from_affine(DAffine3::from_scale(DVec3::splat(size))).unwrap_err().contains("between"));
+        }
     }
 }

@@ -8,8 +8,10 @@ use crate::error::Result;
 use crate::grid::{Grid, LEAF_DIM, LeafMask, LeafValues, Transform, offset_to_local};
 use crate::run::RunOptions;
 
-/// Edge, in voxels, of the blocks that the search for the surface starts from: a multiple of the leaf's edge by a power of two.
-const ROOT_BLOCK: i32 = 1024;
+/// Edge, in voxels, of the largest block that the search for the surface can start from: index space is eight of them.
+const LARGEST_BLOCK: i32 = 1 << 30;
+
+const OPERATION: &str = "sampling a distance function";
 
 /// Bytes that a leaf costs while it is built: its values twice (collected, then in pages), mask and tables.
 const BYTES_A_LEAF: u64 = 2 * 2048 + 512;
@@ -31,21 +33,19 @@ impl LevelSet {
         let background = background(half_width, &transform);
         let scale = transform.voxel_size();
         let band = f64::from(half_width);
-        let origins = leaves_near(lo, hi, &|block: IVec3, edge: i32| {
+        let near = |block: IVec3, edge: i32| {
             let centre = block.as_dvec3() + DVec3::splat(f64::from(edge - 1) / 2.0);
             let reach = f64::from(edge - 1) / 2.0 * 3f64.sqrt() + band;
             distance(centre).abs() <= reach
-        });
-        run.check("sampling a distance function")?;
-        run.reserve(
-            "sampling a distance function",
-            origins.len() as u64 * BYTES_A_LEAF,
-            "take a larger voxel_size or a narrower band",
-        )?;
+        };
+        let origins = leaves_near(lo, hi, near, run)?;
         // Corner leaves of the search hold no band: keep only those with an active voxel.
         let leaves: Vec<(IVec3, LeafValues, LeafMask)> = origins
             .into_par_iter()
             .filter_map(|origin| {
+                if run.is_cancelled() {
+                    return None;
+                }
                 let mut values = LeafValues::default();
                 let mut mask = LeafMask::EMPTY;
                 for (offset, value) in values.0.iter_mut().enumerate() {
@@ -57,6 +57,7 @@ impl LevelSet {
                 (!mask.is_empty()).then_some((origin, values, mask))
             })
             .collect();
+        run.check(OPERATION)?;
         Ok(Self::new(grid_of_leaves(background, leaves), transform))
     }
 }
@@ -78,29 +79,38 @@ pub(crate) fn grid_of_leaves(background: f32, mut leaves: Vec<(IVec3, LeafValues
 }
 
 /// Origins of the leaves between the voxels `lo` and `hi` for which `near(block, edge)` holds, for the leaf and every block around it.
-fn leaves_near(lo: IVec3, hi: IVec3, near: &(impl Fn(IVec3, i32) -> bool + Sync)) -> Vec<IVec3> {
-    let first: IVec3 = lo & !(ROOT_BLOCK - 1);
-    let mut roots = Vec::new();
-    for x in (first.x..=hi.x).step_by(ROOT_BLOCK as usize) {
-        for y in (first.y..=hi.y).step_by(ROOT_BLOCK as usize) {
-            for z in (first.z..=hi.z).step_by(ROOT_BLOCK as usize) {
-                roots.push(IVec3::new(x, y, z));
-            }
-        }
+///
+/// Goes down level by level: the blocks of one are about as many as the leaves of a surface as much smaller, so that work which
+/// needs more memory than there may be is refused long before it is done.
+fn leaves_near(
+    lo: IVec3,
+    hi: IVec3,
+    near: impl Fn(IVec3, i32) -> bool + Sync,
+    run: &RunOptions,
+) -> Result<Vec<IVec3>> {
+    let farthest = lo.abs().max(hi.abs()).max_element().clamp(LEAF_DIM, LARGEST_BLOCK);
+    let mut edge = (farthest as u32).next_power_of_two() as i32;
+    let eight = |corner: IVec3, edge: i32| (0..8).map(move |c| corner + IVec3::new(c >> 2, c >> 1 & 1, c & 1) * edge);
+    let wanted = |block: &IVec3, edge: i32| {
+        let within = block.cmple(hi).all() && (*block + IVec3::splat(edge - 1)).cmpge(lo).all();
+        within && !run.is_cancelled() && near(*block, edge)
+    };
+    let mut blocks: Vec<IVec3> = eight(IVec3::splat(-edge), edge).filter(|block| wanted(block, edge)).collect();
+    while edge > LEAF_DIM {
+        edge /= 2;
+        blocks = blocks.into_par_iter().flat_map_iter(|b| eight(b, edge)).filter(|b| wanted(b, edge)).collect();
+        run.check(OPERATION)?;
+        reserve(blocks.len() as u64, edge, run)?;
     }
-    roots.into_par_iter().flat_map(|root| descend(root, ROOT_BLOCK, near)).collect()
+    Ok(blocks)
 }
 
-fn descend(block: IVec3, edge: i32, near: &(impl Fn(IVec3, i32) -> bool + Sync)) -> Vec<IVec3> {
-    if !near(block, edge) {
-        return Vec::new();
+/// Refuses what needs too much memory already if each block of this edge holds one leaf; says what it would need in all.
+fn reserve(blocks: u64, edge: i32, run: &RunOptions) -> Result<()> {
+    if run.memory_limit.is_none_or(|limit| blocks.saturating_mul(BYTES_A_LEAF) <= limit) {
+        return Ok(());
     }
-    if edge == LEAF_DIM {
-        return vec![block];
-    }
-    let half = edge / 2;
-    (0..8)
-        .into_par_iter()
-        .flat_map(|c| descend(block + IVec3::new(c >> 2, c >> 1 & 1, c & 1) * half, half, near))
-        .collect()
+    // A surface meets four of a block's eight halves.
+    let leaves = (u64::from((edge / LEAF_DIM).unsigned_abs())).saturating_pow(2).saturating_mul(blocks);
+    run.reserve(OPERATION, leaves.saturating_mul(BYTES_A_LEAF), "take a larger voxel_size or a narrower band")
 }

@@ -9,6 +9,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 
 use crate::error::EditError;
+use crate::grid::VOXEL_SIZES;
 
 /// A number with an optional unit: `3vx` is voxels, `0.5wu` world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -174,9 +175,6 @@ pub(crate) fn voxel_size(operation: &str, size: WorldLength) -> Result<f64, Edit
     let accepted = format!("a size in world units between {:e} and {:e}", VOXEL_SIZES.start(), VOXEL_SIZES.end());
     Err(EditError::parameter(operation, "voxel_size", size, accepted))
 }
-
-/// Voxel sizes whose squares and products stay within f32 in every kernel.
-const VOXEL_SIZES: std::ops::RangeInclusive<f64> = 1e-9..=1e9;
 
 /// Comma-separated numbers.
 pub(crate) fn parse_numbers(text: &str) -> Result<Vec<f64>, String> {

@@ -9,10 +9,13 @@ use rayon::prelude::*;
 use super::bridge::ffi;
 use super::listing::{Compression, Precision};
 use super::read::{PIPE, VdbFile};
-use crate::atomic::Unfinished;
+use crate::atomic::{Unfinished, final_target};
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, Transform};
 use crate::levelset::LevelSet;
+
+/// The smallest edge of a voxel that OpenVDB's maps take: they refuse determinants below 3e-15.
+const SMALLEST_VOXEL: f64 = 1.45e-5;
 
 /// How a file is written. The default keeps what the input had, else float and blosc.
 #[derive(Clone, Debug, Default)]
@@ -61,6 +64,11 @@ pub fn write(
     let output = Target { path };
     let compression = options.compression.or_else(|| Compression::of_all(&input?.listing().grids));
     let compression = compression.unwrap_or(Compression::Blosc);
+    if let Some(small) = grids.iter().map(|g| g.level_set.voxel_size()).find(|size| *size < SMALLEST_VOXEL) {
+        return Err(output.error(format!(
+            "OpenVDB stores no voxels smaller than {SMALLEST_VOXEL} world units, these are {small:e}: scale the model up, as by `transform --scale 1000`"
+        )));
+    }
     let (mut content, count) = collect(grids, input, options).map_err(|e| output.error(e.what()))?;
     let bytes = output.write(content.pin_mut(), compression.flags())?;
     let mut warnings: Vec<_> =
@@ -176,8 +184,11 @@ impl Target<'_> {
         if self.path == Path::new(PIPE) {
             return self.write_through(content, compression, std::io::stdout().lock());
         }
-        // Through a link to the file that it names; that file is what is replaced.
-        let real = std::fs::canonicalize(self.path).unwrap_or_else(|_| self.path.to_path_buf());
+        // Devices are asked for by the path as given: links like /dev/stdout lead to names that only the kernel can follow.
+        let real = match std::fs::metadata(self.path) {
+            Ok(facts) if !facts.is_file() => self.path.to_path_buf(),
+            _ => final_target(self.path)?,
+        };
         match std::fs::metadata(&real) {
             Ok(facts) if facts.is_dir() => Err(self.error("it is a directory")),
             Ok(facts) if !facts.is_file() => {

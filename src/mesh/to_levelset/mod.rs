@@ -27,7 +27,7 @@ use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes};
 use super::topology::{boundary_chain, edge_uses};
 use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber};
 use crate::error::{EditError, Result};
-use crate::grid::{LeafMask, LeafValues, MAX_COORD, Transform};
+use crate::grid::{LeafMask, LeafValues, MAX_COORD, Transform, VOXEL_SIZES};
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, background, grid_of_leaves};
 use crate::run::RunOptions;
 
@@ -60,10 +60,9 @@ impl MeshToLevelSet {
             let accepted = "it must be positive and finite, in the mesh's units";
             return Err(EditError::parameter(OPERATION, "voxel_size", self.voxel_size, accepted));
         }
-        let background = (self.voxel_size * f64::from(self.half_width)) as f32;
-        if !(background.is_normal() && (self.voxel_size as f32).is_normal()) {
-            let accepted = "distances are stored as f32, whose range of 1e-38 to 3e38 it must stay in";
-            return Err(EditError::parameter(OPERATION, "voxel_size", self.voxel_size, accepted));
+        if !VOXEL_SIZES.contains(&self.voxel_size) {
+            let accepted = format!("{:e} to {:e} world units", VOXEL_SIZES.start(), VOXEL_SIZES.end());
+            return Err(EditError::parameter(OPERATION, "voxel_size", format!("{:e}", self.voxel_size), accepted));
         }
         if !(NARROWEST..=WIDEST).contains(&self.half_width) {
             let accepted = format!("the band reaches {NARROWEST} to {WIDEST} voxels to each side (3 is usual)");
@@ -81,8 +80,8 @@ pub fn mesh_to_level_set(
     params: &MeshToLevelSet,
     run: &RunOptions,
 ) -> Result<(LevelSet, MeshFindings)> {
-    params.validate()?;
     check_numbers(mesh)?;
+    params.validate()?;
     check_range(mesh, params)?;
     let (mut clean, mut findings) = prepare(mesh);
     if clean.triangles.is_empty() {
@@ -197,6 +196,12 @@ fn check_numbers(mesh: &TriangleMesh) -> Result<()> {
     {
         let problem =
             format!("vertex {v} (of triangle {t}) is at {}: coordinates must be finite", mesh.positions[v as usize]);
+        return Err(EditError::input("mesh", problem));
+    }
+    let farthest = mesh.bounding_box().map_or(0.0, |(lo, hi)| lo.abs().max(hi.abs()).max_element());
+    let room = f64::from(MAX_COORD) * VOXEL_SIZES.end();
+    if farthest > room {
+        let problem = format!("coordinates reach {farthest:e}: there are no voxels for more than {room:e}; scale it down");
         return Err(EditError::input("mesh", problem));
     }
     Ok(())

@@ -1,0 +1,278 @@
+//! What is promised of every operator, asked of each one in the registry: a new operator is tested by being listed.
+
+use glam::{DVec3, IVec3};
+use serde_json::{Map, Value, json};
+use vdb_edit::LevelSet;
+use vdb_edit::grid::{Transform, offset_to_local};
+use vdb_edit::ops::csg::{CsgOperation, csg};
+use vdb_edit::ops::{Arity, Entry, REGISTRY, find};
+use vdb_edit::region::parse_regions;
+use vdb_edit::run::RunOptions;
+
+const DX: f64 = 0.1;
+/// Acts on about a third of each subject.
+const REGION: &str = "sphere center=0.8,0,0 radius=0.9";
+
+/// Parameters without which an operator has nothing to do.
+fn needed(entry: &Entry) -> Map<String, Value> {
+    let values = match entry.name {
+        "shape" => json!({ "spec": "torus major=1 minor=0.4 axis=x", "voxel_size": DX }),
+        // Off the lattice, so that voxels are computed.
+        "transform" => json!({ "steps": ["rotate z,30", "translate 0.123,0,0"] }),
+        _ => json!({}),
+    };
+    values.as_object().unwrap().clone()
+}
+
+fn made(distance: impl Fn(DVec3) -> f64 + Sync) -> LevelSet {
+    let (transform, bounds) = (Transform::uniform(DX), (IVec3::splat(-24), IVec3::splat(24)));
+    LevelSet::from_distance(transform, 3.0, bounds, |ijk| distance(ijk * DX) / DX, &RunOptions::default()).unwrap()
+}
+
+fn box_distance(p: DVec3, half: DVec3) -> f64 {
+    let q = p.abs() - half;
+    q.max(DVec3::ZERO).length() + q.max_element().min(0.0)
+}
+
+/// A smooth surface, sharp edges, and a field that is no distance near the crease.
+fn subjects() -> Vec<(&'static str, LevelSet)> {
+    let sphere = made(|p| p.distance(DVec3::new(0.03, -0.02, 0.01)) - 1.2);
+    let block = made(|p| box_distance(p - DVec3::new(0.2, 0.0, 0.05), DVec3::new(1.0, 0.7, 0.5)));
+    let union = csg(&sphere, &block, CsgOperation::Difference);
+    vec![("sphere", sphere), ("box", block), ("difference", union)]
+}
+
+fn inputs(entry: &Entry, subject: &LevelSet) -> Vec<LevelSet> {
+    let other = || made(|p| p.distance(DVec3::new(0.9, 0.4, 0.2)) - 0.8);
+    match entry.arity {
+        Arity::Source => vec![],
+        Arity::One => vec![subject.clone()],
+        Arity::Many => vec![subject.clone(), other()],
+    }
+}
+
+fn run(entry: &Entry, values: Map<String, Value>, subject: &LevelSet) -> LevelSet {
+    let outcome = entry.run(values, inputs(entry, subject), &RunOptions::default());
+    outcome.unwrap_or_else(|e| panic!("{}: {e}", entry.name)).level_set
+}
+
+/// Everything of a level set, bit by bit.
+type Bits = (Vec<(IVec3, Vec<u32>, Vec<usize>)>, Vec<(IVec3, i32)>, u32, Transform);
+
+fn bits(level_set: &LevelSet) -> Bits {
+    let grid = level_set.grid();
+    let leaf = |&id| {
+        let values = grid.values(id).0.iter().map(|v| v.to_bits()).collect();
+        (grid.origin(id), values, grid.mask(id).iter().collect())
+    };
+    let leaves = grid.leaves().iter().map(leaf).collect();
+    (leaves, grid.inside_tiles(), level_set.background().to_bits(), *level_set.transform())
+}
+
+#[test]
+fn names_are_unique_and_well_formed() {
+    let word = |name: &str| {
+        !name.is_empty()
+            && name.starts_with(|c: char| c.is_ascii_lowercase())
+            && !name.ends_with('_')
+            && !name.contains("__")
+            && name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')
+    };
+    for (i, entry) in REGISTRY.iter().enumerate() {
+        assert!(word(entry.name), "{}", entry.name);
+        assert!(REGISTRY[..i].iter().all(|other| other.name != entry.name), "{} is there twice", entry.name);
+        assert_eq!(find(entry.name).unwrap().name, entry.name);
+        let parameters = entry.parameters();
+        for (j, parameter) in parameters.iter().enumerate() {
+            assert!(word(&parameter.name), "{}: {}", entry.name, parameter.name);
+            assert!(parameters[..j].iter().all(|other| other.name != parameter.name), "{}", parameter.name);
+        }
+        let misspelt = format!("{}x", entry.name);
+        assert!(find(&misspelt).err().unwrap().to_string().contains(&format!("`{}`", entry.name)), "{misspelt}");
+    }
+}
+
+#[test]
+fn every_operator_and_parameter_is_documented() {
+    let sentence = |text: &str| text.starts_with(char::is_uppercase) && text.trim_end().ends_with('.');
+    for entry in REGISTRY {
+        assert!(sentence(&entry.help()), "{}: `{}`", entry.name, entry.help());
+        for parameter in entry.parameters() {
+            assert!(sentence(&parameter.help), "{} {}: `{}`", entry.name, parameter.name, parameter.help);
+            assert!(!parameter.kind.is_empty() && parameter.kind != "value", "{} {}", entry.name, parameter.name);
+        }
+    }
+}
+
+#[test]
+fn defaults_agree_with_the_schema_and_survive_json() {
+    for entry in REGISTRY {
+        let schema = entry.schema();
+        let properties = schema.get("properties").and_then(Value::as_object).unwrap();
+        let mut defaults = needed(entry);
+        for parameter in entry.parameters() {
+            let said = properties[&parameter.name].get("default").cloned().unwrap_or(Value::Null);
+            assert_eq!(said, parameter.default, "{} {}: schema and default", entry.name, parameter.name);
+            if !parameter.default.is_null() {
+                defaults.entry(parameter.name).or_insert(parameter.default);
+            }
+        }
+        let text = serde_json::to_string(&defaults).unwrap();
+        let back: Map<String, Value> = serde_json::from_str(&text).unwrap();
+        assert_eq!(back, defaults);
+        entry.check(back).unwrap_or_else(|e| panic!("{}: its own defaults are refused: {e}", entry.name));
+    }
+}
+
+/// Said or left unsaid, a default does the same.
+#[test]
+fn defaults_given_in_toml_change_nothing() {
+    let (_, subject) = &subjects()[2];
+    for entry in REGISTRY {
+        let mut table = needed(entry);
+        let defaults = entry.parameters().into_iter().filter(|p| !p.default.is_null());
+        defaults.for_each(|p| drop(table.entry(p.name).or_insert(p.default)));
+        let text = toml::to_string(&table).unwrap();
+        let back: Map<String, Value> = toml::from_str(&text).unwrap();
+        let (said, unsaid) = (run(entry, back, subject), run(entry, needed(entry), subject));
+        assert!(bits(&said) == bits(&unsaid), "{}: {text}", entry.name);
+    }
+}
+
+#[test]
+fn unknown_parameters_are_refused_with_the_nearest() {
+    for entry in REGISTRY {
+        for parameter in entry.parameters() {
+            let misspelt = format!("{}x", parameter.name);
+            let mut values = needed(entry);
+            values.insert(misspelt.clone(), json!(1));
+            let error = entry.check(values).unwrap_err();
+            assert_eq!(error.exit_code(), 2);
+            let text = error.to_string();
+            assert!(text.contains(entry.name) && text.contains(&misspelt), "{text}");
+            assert!(text.contains(&format!("did you mean `{}`", parameter.name)), "{text}");
+        }
+    }
+}
+
+#[test]
+fn values_of_the_wrong_kind_are_blamed_by_name() {
+    for entry in REGISTRY {
+        for parameter in entry.parameters() {
+            for wrong in [json!({ "a": 1 }), json!([[1]]), json!("no such word, no number")] {
+                if wrong.is_string() && (parameter.kind == "string" || parameter.is_list) {
+                    continue;
+                }
+                let mut values = needed(entry);
+                values.insert(parameter.name.clone(), wrong.clone());
+                let error = entry.check(values).err().unwrap_or_else(|| {
+                    panic!("{} takes {wrong} for {}", entry.name, parameter.name);
+                });
+                assert_eq!(error.exit_code(), 2, "{error}");
+                assert!(error.to_string().contains(&parameter.name), "{error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_number_of_inputs_is_checked() {
+    let (_, subject) = &subjects()[0];
+    for entry in REGISTRY {
+        let wrong: &[usize] = match entry.arity {
+            Arity::Source => &[1, 2],
+            Arity::One => &[0, 2],
+            Arity::Many => &[0, 1],
+        };
+        for &count in wrong {
+            let result = entry.run(needed(entry), vec![subject.clone(); count], &RunOptions::default());
+            let error = result.err().unwrap_or_else(|| panic!("{} takes {count} inputs", entry.name));
+            assert_eq!(error.exit_code(), 2);
+            assert!(error.to_string().contains("inputs"), "{error}");
+        }
+    }
+}
+
+#[test]
+fn results_are_valid_level_sets_and_inputs_stay_as_they_were() {
+    for (name, subject) in subjects() {
+        assert_eq!(subject.check(), [], "{name}");
+        let before = bits(&subject);
+        for entry in REGISTRY {
+            let result = run(entry, needed(entry), &subject);
+            assert_eq!(result.check(), [], "{} of the {name}", entry.name);
+            assert!(!result.is_empty(), "{} of the {name}", entry.name);
+            assert!(bits(&subject) == before, "{} changed its input", entry.name);
+        }
+    }
+}
+
+#[test]
+fn nothing_in_gives_nothing_out() {
+    let nothing = LevelSet::empty(Transform::uniform(DX), 3.0);
+    for entry in REGISTRY.iter().filter(|entry| entry.arity != Arity::Source) {
+        let count = if entry.arity == Arity::Many { 2 } else { 1 };
+        let outcome = entry.run(needed(entry), vec![nothing.clone(); count], &RunOptions::default());
+        let result = outcome.unwrap_or_else(|e| panic!("{}: {e}", entry.name)).level_set;
+        assert!(result.is_empty() && result.check().is_empty(), "{}", entry.name);
+    }
+}
+
+#[test]
+fn runs_and_thread_counts_agree_to_the_last_bit() {
+    let pool = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    let (one, four) = (pool(1), pool(4));
+    for (name, subject) in subjects() {
+        for entry in REGISTRY {
+            let once = || bits(&run(entry, needed(entry), &subject));
+            let alone = one.install(once);
+            assert!(alone == one.install(once), "{} of the {name}: two runs", entry.name);
+            assert!(alone == four.install(once), "{} of the {name}: one thread and four", entry.name);
+        }
+    }
+}
+
+#[test]
+fn a_cancelled_run_says_so() {
+    let (_, subject) = &subjects()[0];
+    for entry in REGISTRY {
+        let options = RunOptions::default();
+        options.cancel_flag().store(true, std::sync::atomic::Ordering::Relaxed);
+        let result = entry.run(needed(entry), inputs(entry, subject), &options);
+        let error = result.err().unwrap_or_else(|| panic!("{} ran although cancelled", entry.name));
+        assert_eq!(error.exit_code(), 130, "{}: {error}", entry.name);
+    }
+}
+
+/// Every voxel that was active and has weight 0 keeps its bits.
+#[test]
+fn nothing_happens_outside_the_region() {
+    let region = parse_regions(&[REGION.into()]).unwrap().unwrap();
+    let mut limited = 0;
+    for entry in REGISTRY.iter().filter(|entry| entry.parameters().iter().any(|p| p.name == "region")) {
+        limited += 1;
+        for (name, subject) in subjects() {
+            let mut values = needed(entry);
+            values.insert("region".into(), json!(REGION));
+            let result = run(entry, values, &subject);
+            assert_eq!(result.check(), [], "{} of the {name}", entry.name);
+            let (mut kept, mut changed) = (0, 0);
+            let grid = subject.grid();
+            let mut after = result.grid().accessor();
+            for &id in grid.leaves() {
+                for offset in grid.mask(id).iter() {
+                    let ijk = grid.origin(id) + offset_to_local(offset);
+                    let (was, is) = (grid.values(id).0[offset], after.value(ijk));
+                    if region.weight(subject.transform().voxel_to_world(ijk)) == 0.0 {
+                        assert!(was.to_bits() == is.to_bits() && after.is_active(ijk), "{} {name} {ijk}", entry.name);
+                        kept += 1;
+                    } else {
+                        changed += usize::from(was != is);
+                    }
+                }
+            }
+            assert!(kept > 500 && changed > 200, "{} of the {name}: {kept} kept, {changed} changed", entry.name);
+        }
+    }
+    assert!(limited > 0);
+}
