@@ -6,9 +6,9 @@ use clap::ArgMatches;
 use glam::DVec3;
 use serde_json::Value;
 
-use super::{args, table};
 use super::context::Context;
 use super::volume::{self, BandState, Choice, Volume, VolumeGrid};
+use super::{args, table};
 use crate::error::{EditError, Result};
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, Violation, ViolationKind};
 use crate::mesh::{self, MeshFormat, MeshToLevelSet, Rebuild, TriangleMesh, mesh_to_level_set, rebuild};
