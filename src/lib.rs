@@ -53,6 +53,7 @@
 //! | `vdb` | OpenVDB files and OpenVDB's own tools as a reference (feature `openvdb`) |
 //! | [`render`] | pictures |
 //! | [`ops`] | the operators and their registry |
+//! | `crosscheck` | our operators beside OpenVDB's, timed and compared (feature `openvdb`) |
 //! | `cli` | the command (feature `cli`) |
 //!
 //! # What holds everywhere
@@ -68,6 +69,8 @@
 pub mod atomic;
 #[cfg(feature = "cli")]
 pub mod cli;
+#[cfg(feature = "openvdb")]
+pub mod crosscheck;
 pub mod error;
 pub mod grid;
 pub mod levelset;

@@ -10,6 +10,8 @@ mod compare;
 mod completions;
 mod context;
 mod convert;
+#[cfg(feature = "openvdb")]
+mod crosscheck;
 mod edit;
 mod info;
 mod input;
@@ -47,8 +49,16 @@ struct Verb {
 }
 
 /// All of them, in the order of the help.
-const VERBS: &[Verb] =
-    &[info::VERB, convert::VERB, compare::VERB, render::VERB, completions::COMPLETIONS, completions::MAN];
+const VERBS: &[Verb] = &[
+    info::VERB,
+    convert::VERB,
+    compare::VERB,
+    render::VERB,
+    #[cfg(feature = "openvdb")]
+    crosscheck::VERB,
+    completions::COMPLETIONS,
+    completions::MAN,
+];
 
 /// Runs the command with the arguments of the process.
 pub fn main() -> ExitCode {
