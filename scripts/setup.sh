@@ -71,7 +71,7 @@ build() {
         ensure "${needed[@]}"
     fi
     if ! have cargo; then
-        say "cargo was not found; install Rust 1.88 or newer from https://rustup.rs and run this again"
+        say "cargo was not found; install Rust 1.89 or newer from https://rustup.rs and run this again"
         return 1
     fi
 }

@@ -1,7 +1,7 @@
 //! The command: words become operators, results become tables or JSON, errors become one line and an exit code.
 //!
 //! Operators are found in the registry and get their options from their parameters: a new one needs nothing here. The
-//! verbs that are no operators ([`Verb`]) have a file each. What is said to the user goes through [`report`], and nothing
+//! verbs that are no operators (`Verb`) have a file each. What is said to the user goes through `report`, and nothing
 //! below this module prints.
 
 mod app;

@@ -160,6 +160,18 @@ impl Face {
     /// All six.
     pub const ALL: [Self; 6] = [Self::XMinus, Self::XPlus, Self::YMinus, Self::YPlus, Self::ZMinus, Self::ZPlus];
 
+    /// The face across.
+    pub fn opposite(self) -> Self {
+        match self {
+            Self::XMinus => Self::XPlus,
+            Self::XPlus => Self::XMinus,
+            Self::YMinus => Self::YPlus,
+            Self::YPlus => Self::YMinus,
+            Self::ZMinus => Self::ZPlus,
+            Self::ZPlus => Self::ZMinus,
+        }
+    }
+
     /// The outward unit step.
     pub fn step(self) -> IVec3 {
         match self {

@@ -142,6 +142,15 @@ impl Grid {
         self.map_leaves(f).into_iter().sum()
     }
 
+    /// Calls `f` with the values and masks of every page that holds a leaf of `set`, in parallel; the results in page order.
+    pub fn update_pages<R: Send>(
+        &mut self,
+        set: &LeafSet,
+        f: impl Fn(PageLeaves, &mut [LeafValues], &mut [LeafMask]) -> R + Sync,
+    ) -> Vec<R> {
+        self.values.par_update_pages_with(&mut self.masks, set, f)
+    }
+
     /// Changes the values and masks of the leaves of `set`, in parallel. Inactive voxels must be left at ±background.
     pub fn update(&mut self, set: &LeafSet, f: impl Fn(LeafId, &mut LeafValues, &mut LeafMask) + Sync) {
         self.values.par_update_pages_with(&mut self.masks, set, |leaves, values, masks| {
@@ -149,9 +158,45 @@ impl Grid {
         });
     }
 
-    /// Changes the masks of the leaves of `set`, in parallel.
-    pub fn update_masks(&mut self, set: &LeafSet, f: impl Fn(LeafId, &mut LeafMask) + Sync) {
-        self.masks.par_update(set, f);
+    /// The pages of active masks.
+    pub fn mask_pages(&self) -> &Paged<LeafMask> {
+        &self.masks
+    }
+
+    /// Origins of the absent leaves that face neighbours of the voxels of `seed` lie in, sorted. `seed` has the pages of this grid.
+    pub fn absent_beside(&self, seed: &Paged<LeafMask>) -> Vec<IVec3> {
+        let around = self.neighbours();
+        let mut origins: Vec<IVec3> = self
+            .map_leaves(|id| {
+                let mask = seed.get(id);
+                let mut absent = smallvec::SmallVec::<[IVec3; 6]>::new();
+                for face in Face::ALL {
+                    let beyond = around[id.index()][neighbour_index(face.step())];
+                    if beyond.is_sentinel() && !mask.spill(face).is_empty() {
+                        absent.push(self.origin(id) + face.step() * LEAF_DIM);
+                    }
+                }
+                absent
+            })
+            .into_iter()
+            .flatten()
+            .collect();
+        origins.sort_unstable_by_key(|o| (o.x, o.y, o.z));
+        origins.dedup();
+        origins
+    }
+
+    /// Activates the voxels of `seed` and their face neighbours, in the leaves of `set`.
+    pub fn activate_beside(&mut self, seed: &Paged<LeafMask>, set: &LeafSet) {
+        let around = self.topology.neighbours();
+        self.masks.par_update(set, |id, mask| {
+            let mut grown = seed.get(id).dilated();
+            for face in Face::ALL {
+                let beyond = around[id.index()][neighbour_index(face.step())];
+                grown = grown.zip(seed.get(beyond).spill(face.opposite()), |a, b| a | b);
+            }
+            *mask = mask.zip(grown, |a, b| a | b);
+        });
     }
 
     /// Changes the values and masks of all leaves, in parallel.

@@ -59,7 +59,7 @@ impl<'a> Sampler<'a> {
     }
 
     /// The surface point closest to an index-space position within the band, by Newton's iteration
-    /// x ← x − φ ∇φ/|∇φ|² (MATH 10.1); `None` where the field has no gradient or the iteration leaves the band.
+    /// x ← x − φ ∇φ/|∇φ|²; `None` where the field has no gradient or the iteration leaves the band.
     /// On a distance field two or three steps reach the accuracy of the interpolation.
     pub fn closest_point(&mut self, ijk: DVec3) -> Option<DVec3> {
         let voxel_size = self.level_set.voxel_size();

@@ -125,7 +125,7 @@ impl Solid {
                 (p - axis * t).length() - radius
             }
             Form::Superellipsoid { radii, exponents: [e1, e2] } => {
-                // s − 1 with the homogeneous s of MATH 2.3, times the length of a unit of s along the ray.
+                // s − 1 with the homogeneous s of Barr 1981, times the length of a unit of s along the ray.
                 let s = lp(lp(q.x / radii.x, q.y / radii.y, e2), q.z / radii.z, e1);
                 (s - 1.0) * if s > 0.0 { (q.length() / s).max(radii.min_element()) } else { radii.min_element() }
             }

@@ -4,7 +4,7 @@
 //! signs come from the field itself, or on another lattice from crossings. Against a true distance field the error is that
 //! of the polygons: they lie up to 3/8·h²κ inside a smooth surface of curvature κ (half a cell's diagonal, squared, over the
 //! diameter), and cut off up to half a voxel of a sharp edge. The surface of an offset is the set of points at that
-//! distance: no steps, no error that grows with the distance (MATH 5).
+//! distance: no steps, no error that grows with the distance.
 
 use glam::{DVec3, IVec3};
 

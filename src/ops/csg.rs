@@ -1,4 +1,4 @@
-//! Constructive solid geometry: union (paste), intersection (copy), difference (cut) (Museth et al. 2002, section 4; MATH 4.1).
+//! Constructive solid geometry: union (paste), intersection (copy), difference (cut) (Museth et al. 2002, section 4).
 //!
 //! With φ negative inside: union min(a, b), intersection max(a, b), difference max(a, −b), voxel by voxel, the state of a
 //! voxel being that of the operand it comes from; a tie is the first operand's. Nothing is renormalised: the result is

@@ -104,7 +104,7 @@ mod tests {
     use super::*;
     use crate::grid::{Transform, offset_to_local};
 
-    /// The field x² − R² of a sphere, scaled: right zero set, wrong everywhere else (MATH 1.2).
+    /// The field x² − R² of a sphere, scaled: right zero set, wrong everywhere else.
     fn quadratic_sphere(radius: f64) -> LevelSet {
         let bounds = (IVec3::splat(-28), IVec3::splat(28));
         // Cut off where it would exceed the distance, which sampling relies on.
@@ -137,7 +137,7 @@ mod tests {
         assert!(errors(&rebuilt, 20.0, 3.0).1 < 0.03, "{:?}", errors(&rebuilt, 20.0, 3.0));
         let params = Renormalize { iterations: 20, ..Renormalize::default() };
         let renormalized = params.apply(vec![bad.clone()], &run).unwrap().level_set;
-        // MATH 1.2 measures 0.015 mean and 0.052 at most for WENO5, RK3, 20 iterations.
+        // An independent computation gives 0.015 mean and 0.052 at most for WENO5, RK3, 20 iterations.
         let (mean, worst) = errors(&renormalized, 20.0, 3.0);
         assert!(mean < 0.02 && worst < 0.08, "{mean} {worst}");
         let first = Renormalize { iterations: 20, scheme: Scheme::First, order: 1 };

@@ -1,8 +1,8 @@
 //! The operators: one file each, and one registry that lists them all.
 //!
 //! An operator is a struct of parameters with plain public fields and a doc comment a field. That struct is the
-//! library's argument, the options of the command and the keys of a recipe; its field documentation is the help. The
-//! command line and recipes find operators in [`REGISTRY`] and know nothing of any one of them.
+//! library's argument and the options of the command; its field documentation is the help. The command line finds operators
+//! in [`REGISTRY`] and knows nothing of any one of them.
 
 pub mod compare;
 pub mod csg;

@@ -1,4 +1,4 @@
-//! Offsets and mathematical morphology with exact distances (Museth et al. 2002, section 5.5; MATH 5).
+//! Offsets and mathematical morphology with exact distances (Museth et al. 2002, section 5.5).
 //!
 //! `offset` moves the surface outwards by a distance, `dilate` outwards and `erode` inwards by a positive one; `open` is
 //! erode, then dilate: what is thinner than twice the distance goes; `close` is dilate, then erode: gaps narrower than
@@ -156,7 +156,7 @@ mod tests {
 
     #[test]
     fn opening_and_closing_of_a_box() {
-        // MATH 5: opening rounds the corners of a box, which retreat by (√3 − 1)·w; closing leaves it as it is.
+        // Opening rounds the corners of a box, which retreat by (√3 − 1)·w; closing leaves it as it is.
         let run = RunOptions::default();
         let half = DVec3::splat(16.3);
         let cube = level_set(24, |p| box_distance(p, half));

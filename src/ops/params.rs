@@ -1,4 +1,4 @@
-//! Kinds of parameters: lengths with units, vectors, regions. They read the same from a recipe and from the command line.
+//! Kinds of parameters: lengths with units, vectors, regions. They read the same from JSON and from the command line.
 
 use std::borrow::Cow;
 use std::fmt;

@@ -1,4 +1,4 @@
-//! The list of operators, and what the command line and recipes need to know of each.
+//! The list of operators, and what the command line needs to know of each.
 
 use schemars::{JsonSchema, Schema, schema_for};
 use serde::Serialize;
@@ -65,7 +65,7 @@ impl From<LevelSet> for Outcome {
 
 /// An operator: a struct of parameters that acts on level sets.
 pub trait Operator: Default + Serialize + DeserializeOwned + JsonSchema + Send + Sync + 'static {
-    /// Its name in recipes and, where it is a command of its own, on the command line.
+    /// Its name, and that of its command.
     const NAME: &'static str;
     /// What it takes.
     const ARITY: Arity;

@@ -1,7 +1,7 @@
 //! Analytic solids as level sets; every one a true distance.
 //!
 //! Spheres, boxes, tori, cylinders and capsules are sampled from their closed-form distance. A superellipsoid or supertoroid
-//! is sampled as an implicit function and its distance rebuilt from the zero set (Barr 1981; MATH 2.3).
+//! is sampled as an implicit function and its distance rebuilt from the zero set (Barr 1981).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

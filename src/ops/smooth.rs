@@ -1,6 +1,6 @@
 //! Smoothing by curvature flow or diffusion, everywhere or in a region.
 //!
-//! `curvature` moves the surface by its mean curvature, F = −H (Museth et al. 2002, equation 9; MATH 4.5): the area
+//! `curvature` moves the surface by its mean curvature, F = −H (Museth et al. 2002, equation 9): the area
 //! falls as fast as it can, a sphere of radius R shrinks as R² − 2t. Central |∇φ|, explicit steps of h²/3.
 //! `laplacian` diffuses the field, φ_t = Δφ, in steps of h²/6: the mean of the six neighbours. On a distance field it is
 //! the same motion twice as fast (Δφ = κ₁ + κ₂); near creases it mixes in the field beyond the medial axis.

@@ -1,7 +1,7 @@
 //! Partial differential equations on the narrow band: the only time loop in the house.
 //!
 //! [`evolve`] moves a surface with a [`SpeedFunction`]; [`renormalize`] restores |∇φ| = 1; [`track`] lets the band follow
-//! the surface: dilate, renormalise, trim. Filters that are no flows use the same [`Tracker`].
+//! the surface: dilate, renormalise, trim. A [`Tracker`] does these steps one by one.
 
 mod domain;
 mod evolve;

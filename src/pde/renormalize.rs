@@ -1,5 +1,5 @@
 //! Renormalisation: φ_τ + S(φ)(|∇φ| − 1) = 0 restores |∇φ| = 1 and keeps the zero set (Sussman, Smereka & Osher 1994;
-//! Peng et al. 1999; MATH 1.2a).
+//! Peng et al. 1999).
 //!
 //! S = φ / √(φ² + |Dφ|²) with Godunov's |Dφ| on unscaled differences, as OpenVDB's tracker has it; τ advances by 0.3, 0.9
 //! or 1.0 voxel for RK1, RK2, RK3. First order shifts the zero set by about 0.04 voxel where it is repeated to

@@ -1,13 +1,15 @@
 //! Tracking: the band follows the surface. Dilate by one voxel, renormalise, trim (OpenVDB's `LevelSetTracker::track`).
 
-use glam::IVec3;
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
 
 use super::SolverOptions;
+use super::domain::Domain;
 use super::tracker::Tracker;
 use crate::error::Result;
-use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, LeafSet, Paged, neighbour_index};
+use crate::grid::{Face, LeafId, LeafMask, LeafSet, LeafValues, PageLeaves, Paged, neighbour_index};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
+use crate::stencil::simd::{Lanes, Work, dispatch};
 
 /// Dilates, renormalises and trims the whole band once.
 pub fn track(level_set: &mut LevelSet, solver: &SolverOptions, run: &RunOptions) -> Result<()> {
@@ -25,11 +27,10 @@ impl Tracker<'_> {
 
     /// Activates the face neighbours of the voxels that may have moved. They start at ±background.
     pub fn dilate_band(&mut self) {
-        let new_origins = absent_neighbours(self.grid, &self.domain_moving());
-        let added = self.grid.add_leaves(&new_origins);
+        let added = self.grid.add_leaves(&self.grid.absent_beside(&self.moving()));
         let pages = self.grid.value_pages().page_count();
         for buffer in &mut self.buffers {
-            buffer.grow(pages, crate::grid::LeafValues::default());
+            buffer.grow(pages, LeafValues::default());
             for &id in &added {
                 buffer.get_mut(id).clone_from(self.grid.values(id));
             }
@@ -40,47 +41,25 @@ impl Tracker<'_> {
         if let (Some(weights), Some(region)) = (self.domain.weights_mut(), self.region) {
             weights.extend(self.grid, &self.transform, region, &added);
         }
-        let moving = self.domain_moving();
-        let mut grown = moving.clone();
-        let around = self.grid.neighbours();
-        grown.par_update(self.domain.leaves(), |id, grown| {
-            *grown = grown.dilated();
-            for face in Face::ALL {
-                let n = around[id.index()][neighbour_index(face.step())];
-                *grown = grown.zip(moving.get(n).spill(opposite(face)), |a, b| a | b);
-            }
-        });
-        self.grid.update_masks(self.domain.leaves(), |id, mask| *mask = mask.zip(*grown.get(id), |a, b| a | b));
+        let moving = self.moving();
+        self.grid.activate_beside(&moving, self.domain.leaves());
     }
 
     /// Deactivates the voxels of the domain that lie outside the band, sets them to ±background, and removes empty leaves.
     pub fn trim_band(&mut self) {
         let background = self.grid.background();
-        let domain = &self.domain;
-        let mut trimmed: Paged<LeafMask> = Paged::filled(self.grid.value_pages().page_count(), LeafMask::EMPTY);
-        let leaves = domain.leaves().clone();
-        {
-            let grid = &*self.grid;
-            trimmed.par_update(&leaves, |id, out| {
-                let values = &grid.values(id).0;
-                let repairable = domain.repairable(id, grid.mask(id));
-                for offset in repairable.iter() {
-                    out.set(offset, values[offset].abs() >= background);
-                }
-            });
-        }
-        let touched: LeafSet = leaves.iter().filter(|&id| !trimmed.get(id).is_empty()).collect();
-        self.grid.update(&touched, |id, values, mask| {
-            for offset in trimmed.get(id).iter() {
-                values.0[offset] = background.copysign(values.0[offset]);
-                mask.set(offset, false);
-            }
+        let touched = self.grid.update_pages(self.domain.leaves(), |leaves, values, masks| {
+            let mut touched = Vec::new();
+            dispatch(Trim { domain: &self.domain, background, leaves, values, masks, touched: &mut touched });
+            touched
         });
-        let grid = &*self.grid;
+        let touched: LeafSet = touched.into_iter().flatten().collect();
         for buffer in &mut self.buffers {
+            let grid = &*self.grid;
             buffer.par_update(&touched, |id, values| {
-                for offset in trimmed.get(id).iter() {
-                    values.0[offset] = grid.values(id).0[offset];
+                let (phi, active) = (grid.values(id), grid.mask(id));
+                for (offset, v) in values.0.iter_mut().enumerate() {
+                    *v = if active.get(offset) { *v } else { phi.0[offset] };
                 }
             });
         }
@@ -89,11 +68,12 @@ impl Tracker<'_> {
     }
 
     /// The voxels of the domain's leaves that may have moved.
-    fn domain_moving(&self) -> Paged<LeafMask> {
+    fn moving(&self) -> Paged<LeafMask> {
+        if !self.domain.is_local() {
+            return self.grid.mask_pages().clone();
+        }
         let mut moving = Paged::filled(self.grid.value_pages().page_count(), LeafMask::EMPTY);
-        moving.par_update(self.domain.leaves(), |id, m: &mut LeafMask| {
-            *m = self.domain.moving(id, self.grid.mask(id));
-        });
+        moving.par_update(self.domain.leaves(), |id, m: &mut LeafMask| *m = self.domain.moving(id, self.grid.mask(id)));
         moving
     }
 
@@ -117,34 +97,43 @@ impl Tracker<'_> {
     }
 }
 
-/// Origins of the absent leaves that face neighbours of the voxels of `moving` lie in, sorted.
-fn absent_neighbours(grid: &Grid, moving: &Paged<LeafMask>) -> Vec<IVec3> {
-    let around = grid.neighbours();
-    let mut origins: Vec<IVec3> = grid
-        .map_leaves(|id| {
-            let mask = moving.get(id);
-            let absent = |face: Face| around[id.index()][neighbour_index(face.step())].is_sentinel();
-            Face::ALL
-                .into_iter()
-                .filter(|&face| absent(face) && !mask.spill(face).is_empty())
-                .map(|face| grid.origin(id) + face.step() * LEAF_DIM)
-                .collect::<smallvec::SmallVec<[IVec3; 6]>>()
-        })
-        .into_iter()
-        .flatten()
-        .collect();
-    origins.sort_unstable_by_key(|o| (o.x, o.y, o.z));
-    origins.dedup();
-    origins
+/// Trims the leaves of one page and lists those that lost a voxel.
+struct Trim<'a> {
+    domain: &'a Domain,
+    background: f32,
+    leaves: PageLeaves,
+    values: &'a mut [LeafValues],
+    masks: &'a mut [LeafMask],
+    touched: &'a mut Vec<LeafId>,
 }
 
-fn opposite(face: Face) -> Face {
-    match face {
-        Face::XMinus => Face::XPlus,
-        Face::XPlus => Face::XMinus,
-        Face::YMinus => Face::YPlus,
-        Face::YPlus => Face::YMinus,
-        Face::ZMinus => Face::ZPlus,
-        Face::ZPlus => Face::ZMinus,
+impl Work for Trim<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let background = Lanes::splat(simd, self.background);
+        self.leaves.for_each(
+            #[inline(always)]
+            |id| {
+                let (values, mask) = (&mut self.values[PageLeaves::slot(id)], &mut self.masks[PageLeaves::slot(id)]);
+                let mut trimmed = LeafMask::EMPTY;
+                self.domain.repairable(id, *mask).for_each_pair(
+                    #[inline(always)]
+                    |x, y, bits| {
+                        let at = x * 64 + y * 8;
+                        let phi = Lanes::from_slice(simd, &values.0[at..at + 16]);
+                        let out = phi.abs().simd_ge(background).to_bitmask() & u64::from(bits);
+                        if out != 0 {
+                            let lanes = mask32x16::from_bitmask(simd, out);
+                            lanes.select(background.copysign(phi), phi).store_slice(&mut values.0[at..at + 16]);
+                            trimmed.0[x] |= out << (y * 8);
+                        }
+                    },
+                );
+                if !trimmed.is_empty() {
+                    *mask = mask.zip(trimmed, |m, t| m & !t);
+                    self.touched.push(id);
+                }
+            },
+        );
     }
 }

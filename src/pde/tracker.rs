@@ -70,7 +70,7 @@ impl<'a> Tracker<'a> {
 
     /// One explicit step of `kernel`, integrated in time by `integrator`, at the voxels that `target` names.
     ///
-    /// With L the kernel's Euler step φ + dt·L(φ) (Shu & Osher 1988; MATH 1.1):
+    /// With L the kernel's Euler step φ + dt·L(φ) (Shu & Osher 1988):
     /// RK2: φ' = ½φ + ½E(E(φ)); RK3: φ' = ⅓φ + ⅔E(¾φ + ¼E(E(φ))).
     pub(super) fn integrate(
         &mut self,

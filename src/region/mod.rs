@@ -1,4 +1,4 @@
-//! Where an operator may act, and how strongly: a weight of 0..1 at every point (Museth et al. 2002, section 4.1; MATH 2).
+//! Where an operator may act, and how strongly: a weight of 0..1 at every point (Museth et al. 2002, section 4.1).
 //!
 //! An operator's result is (1 − α)·old + α·new. Where α = 0, every voxel that was active keeps its bits. Regions are
 //! feathered by default, so that the result stays a distance at the region's rim.

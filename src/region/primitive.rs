@@ -1,7 +1,7 @@
 //! Regions inside closed shapes, and half spaces.
 //!
 //! Each closed shape has a function s that is 0 at its centre, 1 on its boundary and grows linearly along rays from the
-//! centre ("0.9" is 90 % of the size in every direction). The weight is D = 1 − P(s; s_min, s_max) (MATH 2.1, 2.3).
+//! centre ("0.9" is 90 % of the size in every direction). The weight is D = 1 − P(s; s_min, s_max).
 
 use glam::{DMat3, DVec3};
 
@@ -138,7 +138,7 @@ mod tests {
 
     #[test]
     fn superellipsoid_is_homogeneous() {
-        // MATH 2.3.
+        // Barr 1981.
         let ellipsoid = Shape::Superellipsoid { radii: DVec3::new(3.0, 2.0, 1.0), exponents: [1.0, 1.0] };
         for (p, s) in [([3.0, 0.0, 0.0], 1.0), ([0.0, 2.0, 0.0], 1.0), ([0.0, 0.0, 1.0], 1.0), ([1.5, 0.0, 0.0], 0.5)] {
             assert!((ellipsoid.size_fraction(DVec3::from(p)) - s).abs() < 1e-12);

@@ -1,6 +1,6 @@
 //! Upwind |∇φ|² of a row: Godunov's choice among one-sided differences, first order or HJ-WENO5.
 //!
-//! For φ_t + S(|∇φ| − 1) = 0 with S of φ's sign, information flows away from the surface (MATH 1.1):
+//! For φ_t + S(|∇φ| − 1) = 0 with S of φ's sign, information flows away from the surface:
 //!
 //! > φ > 0:  |Dφ|² = Σ max( max(D⁻, 0)², min(D⁺, 0)² )
 //! > φ ≤ 0:  |Dφ|² = Σ max( min(D⁻, 0)², max(D⁺, 0)² )

@@ -1,5 +1,5 @@
 //! The raw bridge to OpenVDB. What each function does is said in `cpp/bridge.h`; everything outside this module uses
-//! the safe API of [`io`](super::io) and [`reference`](super::reference).
+//! the safe API of its other files.
 
 #![allow(missing_docs)] // generated items
 

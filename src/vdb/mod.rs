@@ -1,7 +1,7 @@
 //! OpenVDB files: reading, writing, and OpenVDB's own tools as a second opinion.
 //!
 //! [`list`] says what a file holds without loading voxels; [`open`] reads it whole; [`VdbFile::read_level_set`] makes a
-//! level set of one of its grids; [`write()`] puts level sets back beside everything else the file held. [`reference`] runs
+//! level set of one of its grids; [`write()`] puts level sets back beside everything else the file held. [`mod@reference`] runs
 //! OpenVDB's own operators for comparison.
 //!
 //! The C++ side is in `cpp/` and small on purpose: `archive.cc` (files), `grid.cc` (leaves and tiles), `reference.cc`
