@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::band::{Band, BandFacts, diagnose_band};
 use super::bridge::ffi;
-use super::listing::FileListing;
+use super::listing::{FileListing, Precision};
 use super::select::select_level_set;
 use super::structure::{START_BYTES, check_start};
 use crate::error::{EditError, Result};
