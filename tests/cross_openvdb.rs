@@ -4,9 +4,7 @@
 use glam::{DVec3, IVec3};
 use vdb_edit::LevelSet;
 use vdb_edit::grid::Transform;
-use vdb_edit::mesh::{
-    Bvh, MeshToLevelSet, Rebuild, TriangleMesh, level_set_to_mesh, mesh_to_level_set, read, rebuild,
-};
+use vdb_edit::mesh::{Bvh, MeshToLevelSet, Rebuild, TriangleMesh, level_set_to_mesh, mesh_to_level_set, read, rebuild};
 use vdb_edit::ops::csg::{CsgOperation, csg};
 use vdb_edit::ops::morphology::offset;
 use vdb_edit::ops::smooth::{Smooth, SmoothMethod, smooth};
@@ -221,7 +219,8 @@ fn rebuild_against_the_truth() {
         let (ours, theirs) = (error_to(truth, 3.0, &ours), error_to(truth, 3.0, &theirs.to_level_set().unwrap()));
         println!("{name}, rebuilt: error {ours:.1e} voxels, OpenVDB's {theirs:.1e}");
         assert!(ours <= 0.05, "{name}: {ours}");
-        assert!(theirs <= 0.2, "{name}: OpenVDB's {theirs}");
+        // OpenVDB passes on the closest triangle from voxel to voxel, which is not exact far out in the band.
+        assert!(theirs <= 1.0, "{name}: OpenVDB's {theirs}");
     }
 }
 
@@ -229,9 +228,36 @@ fn asset(name: &str) -> TriangleMesh {
     read(format!("{}/assets/{name}", env!("CARGO_MANIFEST_DIR")).as_ref()).unwrap().mesh
 }
 
+/// A unit sphere off the origin, of an octahedron whose edges are cut into `n`: triangles of about one size, unlike those of an
+/// isosurface, on whose slivers f32 distances lose digits.
+fn octahedral_sphere(n: i32) -> TriangleMesh {
+    let mut mesh = TriangleMesh::default();
+    for octant in 0..8 {
+        let sign = DVec3::new([1.0, -1.0][octant & 1], [1.0, -1.0][octant >> 1 & 1], [1.0, -1.0][octant >> 2]);
+        let point = |i: i32, j: i32| {
+            let p = DVec3::new(f64::from(i), f64::from(j), f64::from(n - i - j));
+            (p * sign).normalize() + DVec3::new(0.11, -0.07, 0.03)
+        };
+        let mut add = |corners: [DVec3; 3]| {
+            let first = mesh.positions.len() as u32;
+            mesh.positions.extend(corners);
+            let outwards = sign.element_product() > 0.0;
+            mesh.triangles.push(if outwards { [first, first + 1, first + 2] } else { [first, first + 2, first + 1] });
+        };
+        for i in 0..n {
+            for j in 0..n - i {
+                add([point(i, j), point(i + 1, j), point(i, j + 1)]);
+                if i + j + 1 < n {
+                    add([point(i + 1, j), point(i + 1, j + 1), point(i, j + 1)]);
+                }
+            }
+        }
+    }
+    mesh
+}
+
 /// Meshes of a sphere, a torus and two models, with the voxel size that each is converted at.
 fn meshes() -> Vec<(&'static str, TriangleMesh, f64)> {
-    let (_, sphere) = subjects().swap_remove(0);
     let of = |mesh: TriangleMesh, voxels: f64| {
         let (lo, hi) = mesh.bounding_box().unwrap();
         let size = (hi - lo).max_element() / voxels;
@@ -239,7 +265,7 @@ fn meshes() -> Vec<(&'static str, TriangleMesh, f64)> {
     };
     let named = |name, (mesh, size)| (name, mesh, size);
     vec![
-        named("sphere", of(level_set_to_mesh(&sphere, 0.0, &RunOptions::default()).unwrap(), 70.0)),
+        named("sphere", of(octahedral_sphere(40), 70.0)),
         named("torus", of(asset("torus.obj"), 90.0)),
         named("spot", of(asset("spot.obj"), 110.0)),
         named("goathead", of(asset("goathead.obj"), 100.0)),
@@ -251,13 +277,13 @@ fn meshes() -> Vec<(&'static str, TriangleMesh, f64)> {
 #[test]
 fn mesh_to_level_set_is_that_of_openvdb() {
     for (name, mesh, voxel_size) in meshes() {
-        let (ours, _) =
-            mesh_to_level_set(&mesh, &MeshToLevelSet::new(voxel_size), &RunOptions::default()).unwrap();
+        let (ours, _) = mesh_to_level_set(&mesh, &MeshToLevelSet::new(voxel_size), &RunOptions::default()).unwrap();
         let points: Vec<_> = mesh.positions.iter().map(|p| p.as_vec3()).collect();
         let theirs =
             ReferenceGrid::from_mesh(&points, &mesh.triangles, *ours.transform(), 3.0).unwrap().to_level_set().unwrap();
         let tree = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t).map(|p| p / voxel_size)).collect());
-        let exact = |ijk: IVec3| tree.closest_point(ijk.as_dvec3(), 10.0).map_or(10.0, |hit| hit.distance_squared.sqrt());
+        let exact =
+            |ijk: IVec3| tree.closest_point(ijk.as_dvec3(), 10.0).map_or(10.0, |hit| hit.distance_squared.sqrt());
         let (mut worst, mut signs, mut rim, mut wrong_rim) = (0f64, 0, 0, 0);
         let mut ours_at = ours.grid().accessor();
         let mut theirs_at = theirs.grid().accessor();
@@ -299,7 +325,12 @@ fn area_and_volume(mesh: &ReferenceMesh) -> (f64, f64) {
 /// The polygons of both programs have the same area and volume to 0.1 %.
 #[test]
 fn level_set_to_mesh_has_the_area_and_volume_of_openvdbs() {
-    for (name, level_set) in subjects() {
+    let mut subjects = subjects();
+    // Inscribed polygons lose volume by the square of the curvature in voxels: 0.1 % needs a thicker torus than the others' test.
+    let (bounds, run) = ((IVec3::splat(-95), IVec3::splat(95)), RunOptions::default());
+    let torus = |p: DVec3| (p.x.hypot(p.y) - 64.3).hypot(p.z - 0.4) - 20.7;
+    subjects[1].1 = LevelSet::from_distance(Transform::uniform(0.02), 3.0, bounds, torus, &run).unwrap();
+    for (name, level_set) in subjects {
         let ours = level_set_to_mesh(&level_set, 0.0, &RunOptions::default()).unwrap();
         let (mut area, mut volume) = (0.0, 0.0);
         for t in 0..ours.triangles.len() {

@@ -13,7 +13,7 @@ use common::{names, shared, vdb_edit};
 /// Generous for one file at this resolution, on a slow machine that does other things as well.
 const TIME: Duration = Duration::from_secs(90);
 const MEMORY_LIMIT: &str = "2GiB";
-const RESOLUTION: &str = "48";
+const RESOLUTION: &str = "64";
 
 /// What a mesh must end in.
 enum Mesh {
@@ -192,7 +192,10 @@ enum Volume {
 use Volume::{Edited, Not, Unreadable};
 
 const VOLUMES: &[(&str, Volume)] = &[
-    ("blender_fluid_0152.vdb", Not(&["no level set", "`density` (fog volume, float)", "`velocity` (staggered, vec3s)"])),
+    (
+        "blender_fluid_0152.vdb",
+        Not(&["no level set", "`density` (fog volume, float)", "`velocity` (staggered, vec3s)"]),
+    ),
     ("box_active_tiles.vdb", Not(&["`temperature`", "class", "never set", "--assume-level-set"])),
     ("empty_tree.vdb", Not(&["`density`", "never set", "--assume-level-set"])),
     ("fog_rotated_anisotropic.vdb", Not(&["`density` is a fog volume", "--iso"])),

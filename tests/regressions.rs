@@ -88,7 +88,8 @@ fn solid_tiles_beyond_the_band_cost_nothing() {
     solid.grid_mut().set_sign(IVec3::splat(4096), IVec3::splat(4096 + 1024), true);
     assert!(solid.grid().inside_tiles().len() > level_set.grid().inside_tiles().len());
     store(folder.path(), "solid.vdb", &solid);
-    let read = open(folder.path().join("solid.vdb"), &RunOptions::default()).unwrap().read_level_set(None, false).unwrap();
+    let read =
+        open(folder.path().join("solid.vdb"), &RunOptions::default()).unwrap().read_level_set(None, false).unwrap();
     assert_eq!(read.level_set.grid().inside_tiles(), level_set.grid().inside_tiles());
     assert_eq!(read.level_set.check(), []);
 }

@@ -6,9 +6,9 @@ use clap::ArgMatches;
 use glam::DVec3;
 use serde_json::Value;
 
-use super::{args, table};
 use super::context::Context;
 use super::volume::{self, BandState, Choice, Volume, VolumeGrid};
+use super::{args, table};
 use crate::error::{EditError, Result};
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, Violation, ViolationKind};
 use crate::mesh::{self, MeshFormat, MeshToLevelSet, Rebuild, TriangleMesh, mesh_to_level_set, rebuild};
@@ -342,25 +342,24 @@ fn valid(
         }
     };
     let violations = level_set.check();
-    if violations.is_empty() {
-        if level_set.half_width() >= NARROWEST || level_set.is_empty() {
-            return Ok(level_set);
+    let said = violations.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ");
+    if !violations.is_empty() {
+        if options.repair && !is_rebuilt {
+            warnings.push(format!("{name}: {said}: rebuilt from its surface"));
+            return rebuilt(&level_set, context);
         }
+        if is_gross(&violations, level_set.grid().active_voxels()) {
+            return Err(refuse(said));
+        }
+        warnings.push(format!("{name}: {said}"));
+    }
+    if level_set.half_width() < NARROWEST && !level_set.is_empty() {
         warnings.push(format!(
             "{name}: its band of {} voxels is too narrow to be edited: rebuilt from its surface with {DEFAULT_HALF_WIDTH}",
             table::number(f64::from(level_set.half_width()))
         ));
         return rebuilt(&level_set, context);
     }
-    let said = violations.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ");
-    if options.repair && !is_rebuilt {
-        warnings.push(format!("{name}: {said}: rebuilt from its surface"));
-        return rebuilt(&level_set, context);
-    }
-    if is_gross(&violations, level_set.grid().active_voxels()) {
-        return Err(refuse(said));
-    }
-    warnings.push(format!("{name}: {said}"));
     Ok(level_set)
 }
 
@@ -368,10 +367,7 @@ fn valid(
 fn is_gross(violations: &[Violation], active_voxels: u64) -> bool {
     violations.iter().any(|violation| match violation.kind {
         ViolationKind::NonFinite => true,
-        ViolationKind::TooSteep
-        | ViolationKind::TooFlat
-        | ViolationKind::HoleInBand
-        | ViolationKind::SignMismatch => {
+        ViolationKind::TooSteep | ViolationKind::TooFlat | ViolationKind::HoleInBand | ViolationKind::SignMismatch => {
             violation.count as f64 > TOLERATED * active_voxels as f64
         }
         _ => false,

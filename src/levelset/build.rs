@@ -82,12 +82,7 @@ pub(crate) fn grid_of_leaves(background: f32, mut leaves: Vec<(IVec3, LeafValues
 ///
 /// Goes down level by level: the blocks of one are about as many as the leaves of a surface as much smaller, so that work which
 /// needs more memory than there may be is refused long before it is done.
-fn leaves_near(
-    lo: IVec3,
-    hi: IVec3,
-    near: impl Fn(IVec3, i32) -> bool + Sync,
-    run: &RunOptions,
-) -> Result<Vec<IVec3>> {
+fn leaves_near(lo: IVec3, hi: IVec3, near: impl Fn(IVec3, i32) -> bool + Sync, run: &RunOptions) -> Result<Vec<IVec3>> {
     let farthest = lo.abs().max(hi.abs()).max_element().clamp(LEAF_DIM, LARGEST_BLOCK);
     let mut edge = (farthest as u32).next_power_of_two() as i32;
     let eight = |corner: IVec3, edge: i32| (0..8).map(move |c| corner + IVec3::new(c >> 2, c >> 1 & 1, c & 1) * edge);

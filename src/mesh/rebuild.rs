@@ -66,7 +66,8 @@ pub fn rebuild(level_set: &LevelSet, what: &Rebuild, run: &RunOptions) -> Result
     let field = level_set.grid();
     if reach > WIDEST_SCATTER {
         // Found out before the search: no surface at this distance outwards of anything has less area than a ball of that radius.
-        let least = estimated_bytes(4.0 * std::f64::consts::PI * offset.max(0.0).powi(2), DVec3::splat(2.0 * reach), 0, 0.0);
+        let least =
+            estimated_bytes(4.0 * std::f64::consts::PI * offset.max(0.0).powi(2), DVec3::splat(2.0 * reach), 0, 0.0);
         run.reserve(OPERATION, least, "take a smaller distance")?;
         let bvh = Bvh::new((0..count).map(corners).collect());
         let bounds = index_bounds(&positions, reach)?;

@@ -166,6 +166,8 @@ fn drop_rounded_rim(grid: &mut Grid, widest: f64) {
             }
         }
     });
+    let leaves = grid.leaf_set().clone();
+    grid.prune(&leaves);
 }
 
 /// Copies the leaves and signs of a float or double grid. Inactive voxels become ±background by their sign, once what

@@ -201,7 +201,8 @@ fn check_numbers(mesh: &TriangleMesh) -> Result<()> {
     let farthest = mesh.bounding_box().map_or(0.0, |(lo, hi)| lo.abs().max(hi.abs()).max_element());
     let room = f64::from(MAX_COORD) * VOXEL_SIZES.end();
     if farthest > room {
-        let problem = format!("coordinates reach {farthest:e}: there are no voxels for more than {room:e}; scale it down");
+        let problem =
+            format!("coordinates reach {farthest:e}: there are no voxels for more than {room:e}; scale it down");
         return Err(EditError::input("mesh", problem));
     }
     Ok(())
