@@ -35,7 +35,7 @@ fn build(command: Command) -> Command {
                 .allow_hyphen_values(true)
                 .value_parser(ValueParser::new(options::length))
                 .help(
-                    "To meshes: the surface at this distance, positive outside, in world units (or `1vx`) [default: 0]",
+                    "The surface at this distance, positive outside, in world units (or `1vx`) [default: 0]; of a volume that is no level set: at this value",
                 ),
         );
     args::output(args::conversion(args::grids(command), |_| false))

@@ -133,6 +133,7 @@ fn described(arg: Arg, parameter: &Parameter) -> Arg {
     let default = match &parameter.default {
         Value::Null | Value::Bool(false) => String::new(),
         Value::Array(list) if list.is_empty() => String::new(),
+        Value::String(text) if text.is_empty() => String::new(),
         Value::Array(list) => {
             let list: Vec<String> = list.iter().map(plain).collect();
             format!(" [default: {}]", list.join(","))
