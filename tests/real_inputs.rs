@@ -13,7 +13,7 @@ use common::{names, shared, vdb_edit};
 /// Generous for one file at this resolution, on a slow machine that does other things as well.
 const TIME: Duration = Duration::from_secs(90);
 const MEMORY_LIMIT: &str = "2GiB";
-const RESOLUTION: &str = "48";
+const RESOLUTION: &str = "64";
 
 /// What a mesh must end in.
 enum Mesh {

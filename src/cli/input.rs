@@ -24,6 +24,9 @@ const DEFAULT_RESOLUTION: f64 = 256.0;
 /// leave a few voxels askew, and every editing operator repairs them on its way.
 const TOLERATED: f64 = 0.01;
 
+/// The narrowest band, in voxels, that flows keep the surface in: as narrow as meshes may become.
+const NARROWEST: f32 = 1.5;
+
 /// Whether a path stands for standard input or output.
 pub fn is_pipe(path: &Path) -> bool {
     path == Path::new("-")
@@ -339,18 +342,24 @@ fn valid(
         }
     };
     let violations = level_set.check();
-    if violations.is_empty() {
-        return Ok(level_set);
-    }
     let said = violations.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ");
-    if options.repair && !is_rebuilt {
-        warnings.push(format!("{name}: {said}: rebuilt from its surface"));
+    if !violations.is_empty() {
+        if options.repair && !is_rebuilt {
+            warnings.push(format!("{name}: {said}: rebuilt from its surface"));
+            return rebuilt(&level_set, context);
+        }
+        if is_gross(&violations, level_set.grid().active_voxels()) {
+            return Err(refuse(said));
+        }
+        warnings.push(format!("{name}: {said}"));
+    }
+    if level_set.half_width() < NARROWEST && !level_set.is_empty() {
+        warnings.push(format!(
+            "{name}: its band of {} voxels is too narrow to be edited: rebuilt from its surface with {DEFAULT_HALF_WIDTH}",
+            table::number(f64::from(level_set.half_width()))
+        ));
         return rebuilt(&level_set, context);
     }
-    if is_gross(&violations, level_set.grid().active_voxels()) {
-        return Err(refuse(said));
-    }
-    warnings.push(format!("{name}: {said}"));
     Ok(level_set)
 }
 
@@ -358,7 +367,7 @@ fn valid(
 fn is_gross(violations: &[Violation], active_voxels: u64) -> bool {
     violations.iter().any(|violation| match violation.kind {
         ViolationKind::NonFinite => true,
-        ViolationKind::TooSteep | ViolationKind::TooFlat | ViolationKind::HoleInBand => {
+        ViolationKind::TooSteep | ViolationKind::TooFlat | ViolationKind::HoleInBand | ViolationKind::SignMismatch => {
             violation.count as f64 > TOLERATED * active_voxels as f64
         }
         _ => false,

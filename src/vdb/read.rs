@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::band::{Band, BandFacts, diagnose_band};
 use super::bridge::ffi;
-use super::listing::FileListing;
+use super::listing::{FileListing, Precision};
 use super::select::select_level_set;
 use super::structure::{START_BYTES, check_start};
 use crate::error::{EditError, Result};
@@ -84,7 +84,10 @@ impl VdbFile {
             |reason: String| self.error(format!("grid `{}` cannot be a level set: {reason}", listing.selector));
         let transform = listing.uniform_transform().map_err(refuse)?;
         let leaves = ffi::archive_leaves(&self.archive, index).map_err(|e| refuse(e.what().into()))?;
-        let (grid, facts) = read_grid(&leaves, transform.voxel_size()).map_err(refuse)?;
+        let (mut grid, facts) = read_grid(&leaves, transform.voxel_size()).map_err(refuse)?;
+        if listing.precision == Precision::Half {
+            drop_rounded_rim(&mut grid, facts.active.low.abs().max(facts.active.high));
+        }
         let band = diagnose_band(&facts, transform.voxel_size());
         Ok(ReadLevelSet { level_set: LevelSet::new(grid, transform), index, band, facts })
     }
@@ -145,6 +148,26 @@ fn read_all(mut from: impl Read) -> std::io::Result<Vec<u8>> {
 
 fn read_start(path: &Path) -> std::io::Result<Vec<u8>> {
     read_all(std::fs::File::open(path)?.take(START_BYTES as u64))
+}
+
+/// Makes active voxels that half precision has rounded up to the background inactive, as they would be if they were so in float.
+fn drop_rounded_rim(grid: &mut Grid, widest: f64) {
+    // Half numbers have 11 bits: values and background are each off by 2⁻¹² of themselves at most.
+    const ROUNDING: f64 = 1.0 + 1.0 / 1024.0;
+    let background = grid.background();
+    if widest < f64::from(background) || widest > f64::from(background) * ROUNDING {
+        return;
+    }
+    grid.update_all(|_, values, mask| {
+        for (offset, value) in values.0.iter_mut().enumerate() {
+            if mask.get(offset) && value.abs() >= background {
+                *value = background.copysign(*value);
+                mask.set(offset, false);
+            }
+        }
+    });
+    let leaves = grid.leaf_set().clone();
+    grid.prune(&leaves);
 }
 
 /// Copies the leaves and signs of a float or double grid. Inactive voxels become ±background by their sign, once what
@@ -218,14 +241,42 @@ fn set_signs(grid: &mut Grid, leaves: &ffi::Leaves) -> Result<(), String> {
             }
         }
     }
+    // What is inside lies between leaves of the band. A tile that reaches beyond all of them is cut there: its space costs
+    // memory, and a file of a few kilobytes can claim any amount of it.
+    let Some((first, last)) = leaf_box(grid) else { return Ok(()) };
+    let mut boxes = Vec::new();
     for tile in leaves.tiles().map_err(|e| e.what().to_string())? {
         let lo = IVec3::new(tile.x, tile.y, tile.z);
         if tile.value < 0.0 && tile.size > 8 {
             if lo.abs().max_element() > MAX_COORD - tile.size as i32 {
                 return Err(format!("it is solid at voxel {lo}; coordinates go to ±{MAX_COORD}"));
             }
-            grid.set_sign(lo, lo + IVec3::splat(tile.size as i32), true);
+            let (lo, hi) = (lo.max(first), (lo + IVec3::splat(tile.size as i32)).min(last));
+            if lo.cmplt(hi).all() {
+                boxes.push((lo, hi));
+            }
         }
     }
+    let volume: f64 = boxes.iter().map(|(lo, hi)| (hi - lo).as_dvec3().element_product()).sum();
+    let limit = (MOST_SIGN_BYTES + grid.leaves().len() * BYTES_A_LEAF * MOST_SIGNS_A_LEAF) as f64;
+    if volume * SIGN_BYTES_A_VOXEL > limit {
+        return Err(format!("its solid tiles fill {volume:e} voxels, far more than its narrow band can enclose"));
+    }
+    boxes.into_iter().for_each(|(lo, hi)| grid.set_sign(lo, hi, true));
     Ok(())
+}
+
+/// Memory that a node of 16³ absent leaves takes, for each voxel in it.
+const SIGN_BYTES_A_VOXEL: f64 = (16 * 16 * 16 * 4) as f64 / (128.0 * 128.0 * 128.0);
+/// Memory that the signs of solid tiles may take in any file: a solid of 6500³ voxels.
+const MOST_SIGN_BYTES: usize = 1 << 31;
+/// And, of the memory of the leaves, so many times more.
+const MOST_SIGNS_A_LEAF: usize = 4;
+const BYTES_A_LEAF: usize = 2048;
+
+/// First voxel of the box of all leaves, and the one after its last.
+fn leaf_box(grid: &Grid) -> Option<(IVec3, IVec3)> {
+    let origins = grid.leaves().iter().map(|&id| grid.origin(id));
+    let (lo, hi) = origins.map(|o| (o, o)).reduce(|(lo, hi), (o, _)| (lo.min(o), hi.max(o)))?;
+    Some((lo, hi + IVec3::splat(LEAF_DIM)))
 }

@@ -48,7 +48,10 @@ fn only_level_set(grids: &[GridListing], assume_level_set: bool) -> Result<usize
         // The only grid: its own refusal says more than "no level set".
         [] if grids.len() == 1 => Ok(0),
         [] => Err(format!("there is no level set in it; the file holds {}", list(grids))),
-        _ => Err(format!("it holds several level sets: {}; choose one", list(found.iter().map(|&i| &grids[i])))),
+        _ => Err(format!(
+            "it holds several level sets: {}; choose one by its name (--grid)",
+            list(found.iter().map(|&i| &grids[i]))
+        )),
     }
 }
 
