@@ -1,25 +1,15 @@
 //! Triangle meshes: files, and the way to a level set and back.
 
-mod build;
 mod bvh;
 mod closest;
-mod color;
 pub mod files;
 mod findings;
 mod from_levelset;
-mod gltf;
-mod gltf_write;
-mod obj;
-mod off;
-mod ply;
-mod polygon;
 mod prepare;
 mod rebuild;
 mod scatter;
-mod stl;
 #[cfg(test)]
 mod testing;
-mod text;
 mod to_levelset;
 mod topology;
 mod winding;

@@ -17,7 +17,7 @@ use glam::DVec3;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::build::MeshBuilder;
-use super::files::read_beside;
+use super::read_beside;
 use super::text::{lines, number, show, words};
 use super::{ReadMesh, TriangleMesh, color};
 use crate::Result;

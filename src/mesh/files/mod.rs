@@ -8,12 +8,23 @@
 //! | `.glb`, `.gltf` | the default scene with its transforms | with normals |
 //! | `.off` | OFF, COFF, NOFF, STOFF as text | text |
 
+mod build;
+mod color;
+mod gltf;
+mod gltf_write;
+mod obj;
+mod off;
+mod ply;
+mod polygon;
+mod stl;
+mod text;
+
 use std::ffi::OsStr;
 use std::fmt;
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::{TriangleMesh, gltf, gltf_write, obj, off, ply, stl};
+use super::TriangleMesh;
 use crate::atomic::write_atomically;
 use crate::{EditError, Result};
 
@@ -117,7 +128,7 @@ pub fn write_to(out: &mut dyn Write, format: MeshFormat, mesh: &TriangleMesh) ->
 }
 
 /// A file that another one names, relative to it. What is no regular file (a device never ends) is not followed.
-pub(super) fn read_beside(path: &Path, name: &str) -> io::Result<Vec<u8>> {
+fn read_beside(path: &Path, name: &str) -> io::Result<Vec<u8>> {
     let beside = path.with_file_name(name);
     if Path::new(name).is_absolute() || !std::fs::metadata(&beside)?.is_file() {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "not a file beside it"));
@@ -126,7 +137,7 @@ pub(super) fn read_beside(path: &Path, name: &str) -> io::Result<Vec<u8>> {
 }
 
 /// The error of a mesh that a format cannot hold.
-pub(super) fn unwritable(problem: String) -> io::Error {
+fn unwritable(problem: String) -> io::Error {
     io::Error::new(io::ErrorKind::InvalidInput, problem)
 }
 
@@ -191,7 +202,7 @@ mod tests {
         mesh.positions.push(DVec3::new(0.1f32.into(), -2.5, 1e6));
         mesh.triangles.push([1, 3, 2]);
         let bytes = [[0, 127, 255, 255], [9, 8, 7, 255], [255, 0, 0, 255], [1, 2, 3, 255]];
-        let colors = bytes.map(|c: [u8; 4]| super::super::color::decode(c.map(|c| f32::from(c) / 255.0)));
+        let colors = bytes.map(|c: [u8; 4]| super::color::decode(c.map(|c| f32::from(c) / 255.0)));
         mesh.colors = Some(colors.to_vec());
         mesh.uvs = Some(vec![[0.0, 0.0], [0.25, 0.0], [0.0, 0.75], [1.5, -1.0]]);
         for format in MeshFormat::ALL {
