@@ -13,6 +13,7 @@ mod convert;
 mod edit;
 mod info;
 mod input;
+mod mesh_output;
 mod options;
 mod output;
 mod preview;
