@@ -168,6 +168,9 @@ pub fn output(command: Command) -> Command {
                 .long("only-result")
                 .action(ArgAction::SetTrue)
                 .help("Leave the other grids of the input out of the output"),
+            path("attributes-from").long("attributes-from").value_name("MESH").help(
+                "Give a mesh result the colours and texture coordinates of this mesh, by closest point",
+            ),
             Arg::new("precision")
                 .long("precision")
                 .value_parser(["float", "half"])

@@ -4,12 +4,13 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use clap::builder::ValueParser;
-use clap::{Arg, ArgMatches, Command};
+use clap::{Arg, ArgAction, ArgMatches, Command};
 use serde_json::{Map, Value, json};
 
 use super::context::Context;
 use super::edit::{self, Edit};
 use super::input::{self, InputOptions};
+use super::mesh_output::attributes_of;
 use super::output::{Output, Written};
 use super::preview::Preview;
 use super::{Verb, args, options};
@@ -25,7 +26,8 @@ fn build(command: Command) -> Command {
         .about("Turn meshes into level sets, level sets into meshes, and either into another file of its kind")
         .long_about(
             "Turn meshes into level sets, level sets into meshes, and either into another file of its kind.\n\n\
-             A mesh becomes a mesh directly, unless a voxel size or resolution is given: then by way of a level set.",
+             A mesh becomes a mesh directly, unless a voxel size or resolution is given or an option needs a level set \
+             (--iso, --adaptivity, --quads): then by way of one.",
         )
         .arg(args::path("input").value_name("IN").required(true).help("A .vdb, a mesh, or `-`"))
         .arg(
@@ -37,8 +39,40 @@ fn build(command: Command) -> Command {
                 .help(
                     "The surface at this distance, positive outside, in world units (or `1vx`) [default: 0]; of a volume that is no level set: at this value",
                 ),
+        )
+        .arg(
+            Arg::new("simplify")
+                .long("simplify")
+                .value_name("RATIO")
+                .value_parser(ValueParser::new(ratio))
+                .help("To meshes: keep this part of the triangles, above 0 up to 1, where the surface bends most"),
+        )
+        .arg(
+            Arg::new("adaptivity")
+                .long("adaptivity")
+                .value_name("A")
+                .value_parser(ValueParser::new(adaptivity))
+                .conflicts_with("simplify")
+                .help("To meshes: larger triangles where it is flat; none of the vertices left out is farther than A voxels, 0..1, from the result [default: 0]"),
+        )
+        .arg(
+            Arg::new("quads")
+                .long("quads")
+                .action(ArgAction::SetTrue)
+                .conflicts_with_all(["simplify", "adaptivity"])
+                .help("To meshes: quads (.obj, .ply, .off) instead of triangles"),
         );
     args::output(args::conversion(args::grids(command), |_| false))
+}
+
+fn ratio(text: &str) -> Result<f64, String> {
+    let value: Option<f64> = text.trim().parse().ok();
+    value.filter(|r| *r > 0.0 && *r <= 1.0).ok_or_else(|| "a part above 0, up to 1, is wanted".into())
+}
+
+fn adaptivity(text: &str) -> Result<f64, String> {
+    let value: Option<f64> = text.trim().parse().ok();
+    value.filter(|a| (0.0..=1.0).contains(a)).ok_or_else(|| "a number of voxels from 0 to 1 is wanted".into())
 }
 
 fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
@@ -57,7 +91,8 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         };
         return edit::dry_run("convert", Map::new(), &lines, &output, context);
     }
-    if MeshFormat::of(path).is_some() && output.is_mesh() && !input_options.has_size() && iso.is_none() {
+    let needs_level_set = input_options.has_size() || iso.is_some() || output.mesh().needs_level_set();
+    if MeshFormat::of(path).is_some() && output.is_mesh() && !needs_level_set {
         return mesh_to_mesh(path, &output, began, context);
     }
     let mut warnings = Vec::new();
@@ -89,17 +124,27 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
 fn mesh_to_mesh(path: &std::path::Path, output: &Output, began: Instant, context: &Context) -> Result<()> {
     let mut warnings = Vec::new();
     let mesh = input::read_mesh(path, &mut warnings)?;
-    let Written { bytes, .. } = output.write_mesh(&mesh)?;
+    // Attributes go with the vertices, unless the format has no room for them.
+    let is_kept = MeshFormat::of(&output.path).is_some_and(MeshFormat::has_attributes);
+    let lost = attributes_of(&mesh).filter(|_| !is_kept);
+    warnings.extend(lost.and_then(|attributes| output.mesh().loss(path, attributes, &output.path)));
+    let written = output.write_mesh(mesh, context).map_err(|error| input::naming(path, error))?;
+    let Written { bytes, details, warnings: more } = written;
+    warnings.extend(more);
     for warning in &warnings {
         context.reporter.warn(warning);
     }
-    let (vertices, triangles) = (mesh.positions.len(), mesh.triangles.len());
     let seconds = began.elapsed().as_secs_f64();
-    let value = json!({
+    let mut value = json!({
         "operation": "convert", "inputs": [path.display().to_string()], "output": output.path.display().to_string(),
-        "bytes": bytes, "seconds": seconds, "vertices": vertices, "triangles": triangles, "warnings": warnings,
+        "bytes": bytes, "seconds": seconds, "warnings": warnings,
     });
+    if let Some(object) = value.as_object_mut() {
+        object.extend(details.clone());
+    }
     context.reporter.result(&value, || {
-        format!("{}: {vertices} vertices, {triangles} triangles in {seconds:.2} s\n", output.path.display())
+        let details: Vec<String> =
+            details.iter().map(|(name, value)| format!("{} {value}", name.replace('_', " "))).collect();
+        format!("{}: {} in {seconds:.2} s\n", output.path.display(), details.join(", "))
     })
 }

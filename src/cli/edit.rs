@@ -100,9 +100,12 @@ impl Edit {
         }
         preview.write(before, &self.level_set, context)?;
         let from = self.inputs.iter().find_map(Input::from);
-        let Written { bytes, warnings } = output.write(&self.level_set, self.iso, from, context)?;
+        let Written { bytes, warnings, details } = output.write(&self.level_set, self.iso, from, context)?;
         let mut summary = self.summary.clone();
+        let lost = |input: &Input| output.mesh().loss(&input.path, input.attributes?, &output.path);
+        summary.warnings.extend(self.inputs.iter().filter_map(lost));
         summary.warnings.extend(warnings);
+        summary.details.extend(details);
         for warning in &summary.warnings {
             context.reporter.warn(warning);
         }

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::context::Context;
 use super::volume::{self, BandState, Choice, Volume, VolumeGrid};
-use super::{args, table};
+use super::{args, mesh_output, table};
 use crate::error::{EditError, Result};
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, Violation, ViolationKind};
 use crate::mesh::{self, MeshFormat, MeshToLevelSet, Rebuild, TriangleMesh, mesh_to_level_set, rebuild};
@@ -57,6 +57,8 @@ pub struct Input {
     pub level_set: LevelSet,
     /// The `.vdb` that it came from, and its place there if it was a grid of its own.
     pub source: Option<(Volume, Option<usize>)>,
+    /// What the vertices of its mesh carried, which a level set does not.
+    pub attributes: Option<&'static str>,
 }
 
 impl Input {
@@ -195,18 +197,20 @@ pub fn load(
     let conversion = conversion_of(&raw, options)?;
     let mut inputs = Vec::new();
     for (path, raw) in paths.iter().zip(raw) {
-        let (level_set, source) = match raw {
+        let (level_set, source, attributes) = match raw {
             Raw::Volume(read) => {
                 let (volume, grid) = *read;
                 let index = grid.index;
-                (valid(path, grid, options, warnings, context)?, Some((volume, Some(index))))
+                (valid(path, grid, options, warnings, context)?, Some((volume, Some(index))), None)
             }
-            Raw::Mesh(mesh) => (convert(path, &mesh, &conversion, warnings, context)?, None),
+            Raw::Mesh(mesh) => {
+                (convert(path, &mesh, &conversion, warnings, context)?, None, mesh_output::attributes_of(&mesh))
+            }
         };
         if level_set.is_empty() {
             warnings.push(format!("{}: the level set is empty: there is no surface", path.display()));
         }
-        inputs.push(Input { path: path.clone(), level_set, source });
+        inputs.push(Input { path: path.clone(), level_set, source, attributes });
     }
     Ok(inputs)
 }
@@ -234,7 +238,7 @@ pub fn load_iso(
     if level_set.is_empty() {
         return Err(EditError::input(path, format!("no voxel holds more than {iso}: there is no surface")));
     }
-    Ok(Some(Input { path: path.to_path_buf(), level_set, source: Some((volume, None)) }))
+    Ok(Some(Input { path: path.to_path_buf(), level_set, source: Some((volume, None)), attributes: None }))
 }
 
 /// Reads a mesh file.
@@ -243,6 +247,14 @@ pub fn read_mesh(path: &Path, warnings: &mut Vec<String>) -> Result<TriangleMesh
     let read = mesh::read(path)?;
     warnings.extend(read.warnings.into_iter().map(|w| format!("{}: {w}", path.display())));
     Ok(read.mesh)
+}
+
+/// The error with the file of a mesh, which the library does not know.
+pub fn naming(path: &Path, error: EditError) -> EditError {
+    match error {
+        EditError::Input { problem, .. } => EditError::input(path, problem),
+        error => error,
+    }
 }
 
 fn conversion_of(raw: &[Raw], options: &InputOptions) -> Result<MeshToLevelSet> {
@@ -280,11 +292,8 @@ fn convert(
     warnings: &mut Vec<String>,
     context: &Context,
 ) -> Result<LevelSet> {
-    let (level_set, findings) = mesh_to_level_set(mesh, conversion, &context.run).map_err(|error| match error {
-        // The library knows the mesh, not its file.
-        EditError::Input { problem, .. } => EditError::input(path, problem),
-        error => error,
-    })?;
+    let (level_set, findings) =
+        mesh_to_level_set(mesh, conversion, &context.run).map_err(|error| naming(path, error))?;
     warnings.extend(findings.warnings().into_iter().map(|w| format!("{}: {w}", path.display())));
     // Where the mesh was repaired, its own volume says nothing.
     if findings.is_sound() && findings.duplicates_dropped == 0 {

@@ -15,6 +15,7 @@ mod crosscheck;
 mod edit;
 mod info;
 mod input;
+mod mesh_output;
 mod options;
 mod output;
 mod preview;

@@ -3,14 +3,16 @@
 use std::path::{Path, PathBuf};
 
 use clap::ArgMatches;
+use serde_json::{Map, Value};
 
 use super::context::Context;
+use super::mesh_output::MeshOptions;
 use super::volume::{self, Volume};
 use super::{args, input};
 use crate::atomic;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
-use crate::mesh::{self, MeshFormat, level_set_to_mesh};
+use crate::mesh::{MeshFormat, TriangleMesh};
 
 /// A file to be written.
 pub struct Output {
@@ -18,6 +20,7 @@ pub struct Output {
     pub path: PathBuf,
     kind: Kind,
     options: VolumeOptions,
+    mesh: MeshOptions,
 }
 
 /// What it will hold.
@@ -46,6 +49,8 @@ pub struct Written {
     pub bytes: Option<u64>,
     /// What is not as asked.
     pub warnings: Vec<String>,
+    /// What else is worth telling.
+    pub details: Map<String, Value>,
 }
 
 impl Output {
@@ -64,7 +69,13 @@ impl Output {
             compression: word("compression"),
             only_result: args::flag(matches, "only-result"),
         };
-        Ok(Self { path, kind, options })
+        let mesh = MeshOptions::new(matches, &path)?;
+        Ok(Self { path, kind, options, mesh })
+    }
+
+    /// How meshes are written.
+    pub fn mesh(&self) -> &MeshOptions {
+        &self.mesh
     }
 
     /// Whether it is a mesh.
@@ -90,19 +101,16 @@ impl Output {
         match self.kind {
             Kind::Volume => {
                 let (bytes, warnings) = volume::write(&self.path, level_set, from, &self.options)?;
-                Ok(Written { bytes: Some(bytes), warnings })
+                Ok(Written { bytes: Some(bytes), warnings, ..Written::default() })
             }
-            Kind::Mesh => {
-                let mesh = level_set_to_mesh(level_set, iso, &context.run)?;
-                self.write_mesh(&mesh)
-            }
+            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, iso, context),
         }
     }
 
-    /// Writes a mesh as it is.
-    pub fn write_mesh(&self, mesh: &mesh::TriangleMesh) -> Result<Written> {
-        mesh::write(&self.path, mesh)?;
-        Ok(Written { bytes: std::fs::metadata(&self.path).ok().map(|m| m.len()), warnings: Vec::new() })
+    /// Writes a mesh that came from a file.
+    pub fn write_mesh(&self, mesh: TriangleMesh, context: &Context) -> Result<Written> {
+        context.run.check("writing")?;
+        self.mesh.write_mesh(&self.path, mesh, context)
     }
 }
 

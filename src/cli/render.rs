@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use clap::builder::ValueParser;
 use clap::{Arg, ArgAction, ArgMatches, Command, value_parser};
+use glam::DVec3;
 use serde_json::{Map, json};
 
 use super::context::Context;
@@ -26,6 +27,7 @@ enum Color {
     Curvature,
     Normal,
     Region,
+    Component,
     Difference(PathBuf),
 }
 
@@ -38,7 +40,7 @@ fn build(command: Command) -> Command {
         .arg(
             option("color-by", "WHAT")
                 .value_parser(ValueParser::new(color))
-                .help("clay, curvature, normal, region (with --region) or difference:OTHER [default: clay]"),
+                .help("clay, curvature, normal, component, region (with --region) or difference:OTHER [default: clay]"),
         )
         .arg(
             option("region", "SPEC")
@@ -87,9 +89,10 @@ fn color(text: &str) -> Result<Color, String> {
         "curvature" => Color::Curvature,
         "normal" => Color::Normal,
         "region" => Color::Region,
+        "component" => Color::Component,
         _ => match text.strip_prefix("difference:") {
             Some(other) if !other.is_empty() => Color::Difference(other.into()),
-            _ => return Err("there are clay, curvature, normal, region and difference:OTHER".into()),
+            _ => return Err("there are clay, curvature, normal, component, region and difference:OTHER".into()),
         },
     })
 }
@@ -140,7 +143,15 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let inputs = input::load(&all, &input_options, &mut warnings, context)?;
     warnings.iter().for_each(|warning| context.reporter.warn(warning));
     let Some(input) = inputs.first() else { return Ok(()) };
-    let color_by = color.of(inputs.get(1).map(|input| &input.level_set), region.as_deref());
+    let components = match color {
+        Color::Component => Some(input.level_set.components(&context.run)?),
+        _ => None,
+    };
+    let label = |xyz: DVec3| components.as_ref()?.nearest(input.level_set.transform().world_to_index(xyz));
+    let color_by = match color {
+        Color::Component => ColorBy::Label(&label),
+        _ => color.of(inputs.get(1).map(|input| &input.level_set), region.as_deref()),
+    };
     for (path, turn) in &frames {
         let mut options = options.clone();
         options.camera.azimuth += turn;
@@ -157,6 +168,9 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     value.insert("outputs".into(), names.clone().into());
     value.insert("width".into(), options.width.into());
     value.insert("height".into(), options.height.into());
+    if let Some(components) = &components {
+        value.insert("components".into(), components.voxels().len().into());
+    }
     value.insert("seconds".into(), seconds.into());
     value.insert("warnings".into(), warnings.into());
     context.reporter.result(&value.into(), || {

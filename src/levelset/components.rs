@@ -4,70 +4,188 @@
 //! absent leaves along z; parts and runs that touch are then joined. A large interior costs one run a column of
 //! leaves, not its voxels.
 
-use glam::IVec3;
+use std::cmp::Reverse;
+
+use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 use smallvec::SmallVec;
 
-use super::isosurface::IsoSurface;
+use super::LevelSet;
+use super::isosurface::{IsoSurface, MEMORY_ADVICE, corner};
 use super::union_find::UnionFind;
-use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, neighbour_index};
+use crate::error::Result;
+use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, leaf_offset, leaf_origin, neighbour_index};
+use crate::run::RunOptions;
+
+const OPERATION: &str = "components";
+
+/// The connected parts of the inside of a level set, numbered from the largest.
+pub struct Components {
+    grid: Grid,
+    split: Split,
+    /// Component by number of part or run.
+    labels: Vec<u32>,
+    voxels: Vec<u64>,
+}
+
+impl LevelSet {
+    /// Finds the connected parts of the inside.
+    pub fn components(&self, run: &RunOptions) -> Result<Components> {
+        let grid = self.grid();
+        let surface = IsoSurface::new(grid, 0.0, OPERATION, run)?;
+        run.reserve(OPERATION, bytes_needed(grid), MEMORY_ADVICE)?;
+        let split = Split::new(grid, &surface);
+        run.check(OPERATION)?;
+        Ok(Components::new(grid.clone(), split))
+    }
+}
+
+impl Components {
+    fn new(grid: Grid, split: Split) -> Self {
+        let sizes: Vec<u64> = split.parts.iter().flatten().map(|part| u64::from(part.count())).collect();
+        let column = (LEAF_DIM * LEAF_DIM) as u64;
+        let of_runs = split.runs.iter().map(|run| u64::from(run.end.abs_diff(run.origin.z)) * column);
+        let roots: Vec<u32> = (0..split.count_of_numbers()).map(|i| split.sets.root(i)).collect();
+        let mut of_root = vec![0u64; roots.len()];
+        for (&root, size) in roots.iter().zip(sizes.into_iter().chain(of_runs)) {
+            of_root[root as usize] += size;
+        }
+        let mut order: Vec<u32> = (0..split.count_of_numbers()).filter(|&i| roots[i as usize] == i).collect();
+        // Equally large ones keep the order in which they begin.
+        order.sort_by_key(|&root| Reverse(of_root[root as usize]));
+        let mut of = vec![0u32; roots.len()];
+        for (label, &root) in (0..).zip(&order) {
+            of[root as usize] = label;
+        }
+        let labels = roots.iter().map(|&root| of[root as usize]).collect();
+        let voxels = order.iter().map(|&root| of_root[root as usize]).collect();
+        Self { grid, split, labels, voxels }
+    }
+
+    /// Inside voxels of each component, the largest first.
+    pub fn voxels(&self) -> &[u64] {
+        &self.voxels
+    }
+
+    /// The component of an inside voxel; `None` outside.
+    pub fn at(&self, ijk: IVec3) -> Option<u32> {
+        let origin = leaf_origin(ijk);
+        let id = self.grid.find(origin);
+        let number = match id {
+            LeafId::OUTSIDE => return None,
+            LeafId::INSIDE => self.split.run_number(find_run(&self.split.runs, origin)?),
+            _ => {
+                let part = self.split.parts_of(id).iter().position(|part| part.get(leaf_offset(ijk)))?;
+                self.split.first_part[id.index()] + part as u32
+            }
+        };
+        self.labels.get(number as usize).copied()
+    }
+
+    /// The component of the inside voxel that is nearest to an index-space position among the corners of its cell, as for
+    /// points of the surface; `None` if all are outside or the position is far away.
+    pub fn nearest(&self, ijk: DVec3) -> Option<u32> {
+        let limit = f64::from(crate::grid::MAX_COORD - 2);
+        if ijk.is_nan() || ijk.abs().max_element() >= limit {
+            return None;
+        }
+        let first = ijk.floor().as_ivec3();
+        let mut corners: [IVec3; 8] = std::array::from_fn(|c| first + corner(c));
+        corners.sort_by(|a, b| {
+            let [a, b] = [a, b].map(|c| c.as_dvec3().distance_squared(ijk));
+            a.total_cmp(&b)
+        });
+        corners.into_iter().find_map(|c| self.at(c))
+    }
+}
 
 /// Number of connected parts of the inside.
 pub(super) fn count(grid: &Grid, surface: &IsoSurface) -> u64 {
-    let leaves = grid.leaves();
-    let parts: Vec<Parts> = grid.map_leaves(|id| split(*surface.inside(id)));
-    let mut first_part = vec![0u32; grid.neighbours().len()];
-    let mut place = vec![0u32; grid.neighbours().len()];
-    let mut total = 0;
-    for (i, (&id, parts)) in leaves.iter().zip(&parts).enumerate() {
-        first_part[id.index()] = total;
-        place[id.index()] = i as u32;
-        total += parts.len() as u32;
-    }
-    let runs = runs_of(&grid.inside_tiles());
-    let run_number = |i: usize| total + i as u32;
-    let sets = UnionFind::new(total as usize + runs.len());
+    Split::new(grid, surface).sets.count()
+}
 
-    leaves.par_iter().zip(&parts).with_min_len(64).for_each(|(&id, own)| {
-        let origin = grid.origin(id);
-        for face in Face::ALL {
-            let beyond = grid.neighbours()[id.index()][neighbour_index(face.step())];
-            if beyond == LeafId::OUTSIDE {
-                continue;
-            }
-            let upper = matches!(face, Face::XPlus | Face::YPlus | Face::ZPlus);
-            for (i, part) in own.iter().enumerate() {
-                let spill = part.spill(face);
-                let number = first_part[id.index()] + i as u32;
-                if beyond == LeafId::INSIDE {
-                    let run = find_run(&runs, origin + face.step() * LEAF_DIM).filter(|_| !spill.is_empty());
-                    if let Some(run) = run {
-                        sets.join(number, run_number(run));
-                    }
-                } else if upper {
-                    for (k, other) in parts[place[beyond.index()] as usize].iter().enumerate() {
-                        if !spill.zip(*other, |a, b| a & b).is_empty() {
-                            sets.join(number, first_part[beyond.index()] + k as u32);
+/// The parts of the leaves and the runs between them, joined. Parts are numbered leaf by leaf, the runs behind them.
+struct Split {
+    /// Parts by place of the leaf.
+    parts: Vec<Parts>,
+    /// Number of the first part, and place in `parts`, by slot.
+    first_part: Vec<u32>,
+    place: Vec<u32>,
+    total: u32,
+    runs: Vec<Run>,
+    sets: UnionFind,
+}
+
+impl Split {
+    fn new(grid: &Grid, surface: &IsoSurface) -> Self {
+        let leaves = grid.leaves();
+        let parts: Vec<Parts> = grid.map_leaves(|id| split(*surface.inside(id)));
+        let mut first_part = vec![0u32; grid.neighbours().len()];
+        let mut place = vec![0u32; grid.neighbours().len()];
+        let mut total = 0;
+        for (i, (&id, parts)) in leaves.iter().zip(&parts).enumerate() {
+            first_part[id.index()] = total;
+            place[id.index()] = i as u32;
+            total += parts.len() as u32;
+        }
+        let runs = runs_of(&grid.inside_tiles());
+        let run_number = |i: usize| total + i as u32;
+        let sets = UnionFind::new(total as usize + runs.len());
+
+        leaves.par_iter().zip(&parts).with_min_len(64).for_each(|(&id, own)| {
+            let origin = grid.origin(id);
+            for face in Face::ALL {
+                let beyond = grid.neighbours()[id.index()][neighbour_index(face.step())];
+                if beyond == LeafId::OUTSIDE {
+                    continue;
+                }
+                let upper = matches!(face, Face::XPlus | Face::YPlus | Face::ZPlus);
+                for (i, part) in own.iter().enumerate() {
+                    let spill = part.spill(face);
+                    let number = first_part[id.index()] + i as u32;
+                    if beyond == LeafId::INSIDE {
+                        let run = find_run(&runs, origin + face.step() * LEAF_DIM).filter(|_| !spill.is_empty());
+                        if let Some(run) = run {
+                            sets.join(number, run_number(run));
+                        }
+                    } else if upper {
+                        for (k, other) in parts[place[beyond.index()] as usize].iter().enumerate() {
+                            if !spill.zip(*other, |a, b| a & b).is_empty() {
+                                sets.join(number, first_part[beyond.index()] + k as u32);
+                            }
                         }
                     }
                 }
             }
-        }
-    });
-    runs.par_iter().enumerate().for_each(|(i, run)| {
-        for step in [IVec3::X, IVec3::Y] {
-            let beside = run.origin + step * LEAF_DIM;
-            // The first run of that column that ends above this one's beginning.
-            let first = runs.partition_point(|r| (r.origin.x, r.origin.y, r.end) <= (beside.x, beside.y, beside.z));
-            let touching = runs[first..]
-                .iter()
-                .take_while(|r| (r.origin.x, r.origin.y) == (beside.x, beside.y) && r.origin.z < run.end);
-            for k in 0..touching.count() {
-                sets.join(run_number(i), run_number(first + k));
+        });
+        runs.par_iter().enumerate().for_each(|(i, run)| {
+            for step in [IVec3::X, IVec3::Y] {
+                let beside = run.origin + step * LEAF_DIM;
+                // The first run of that column that ends above this one's beginning.
+                let first = runs.partition_point(|r| (r.origin.x, r.origin.y, r.end) <= (beside.x, beside.y, beside.z));
+                let touching = runs[first..]
+                    .iter()
+                    .take_while(|r| (r.origin.x, r.origin.y) == (beside.x, beside.y) && r.origin.z < run.end);
+                for k in 0..touching.count() {
+                    sets.join(run_number(i), run_number(first + k));
+                }
             }
-        }
-    });
-    sets.count()
+        });
+        Self { parts, first_part, place, total, runs, sets }
+    }
+
+    fn run_number(&self, run: usize) -> u32 {
+        self.total + run as u32
+    }
+
+    /// How many parts and runs there are.
+    fn count_of_numbers(&self) -> u32 {
+        self.total + self.runs.len() as u32
+    }
+
+    fn parts_of(&self, id: LeafId) -> &[LeafMask] {
+        &self.parts[self.place[id.index()] as usize]
+    }
 }
 
 /// Bytes that [`count`] needs, where few leaves have more than one part.
@@ -151,6 +269,7 @@ fn find_run(runs: &[Run], origin: IVec3) -> Option<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::levelset::testing::{block, noise, sampled};
 
     #[test]
     fn tiles_become_runs_along_z() {
@@ -164,6 +283,50 @@ mod tests {
         assert_eq!(find_run(&runs, IVec3::new(0, 8, 264)), None);
         assert_eq!(find_run(&runs, IVec3::new(0, 0, -16)), None);
         assert_eq!(find_run(&runs, IVec3::new(128, 0, 0)), None);
+    }
+
+    #[test]
+    fn components_are_numbered_from_the_largest() {
+        // A ball with an absent interior, a small one, and two voxels that touch at an edge of theirs only.
+        let balls = sampled(60, |p| {
+            let large = (p - DVec3::new(-20.0, 0.0, 0.0)).length() - 30.0;
+            large.min((p - DVec3::new(40.0, 3.0, 0.0)).length() - 9.0)
+        });
+        let components = balls.components(&RunOptions::default()).unwrap();
+        let volumes = [30.0f64, 9.0].map(|r| 4.0 / 3.0 * std::f64::consts::PI * r.powi(3));
+        assert_eq!(components.voxels().len(), 2);
+        for (&voxels, volume) in components.voxels().iter().zip(volumes) {
+            // The lattice has none of the points right on the small ball: 3 % of its volume.
+            assert!((voxels as f64 / volume - 1.0).abs() < 0.03, "{voxels} {volume}");
+        }
+        for (ijk, label) in [((-20, 0, 0), Some(0)), ((9, 0, 0), Some(0)), ((40, 3, 0), Some(1)), ((20, 0, 0), None)] {
+            assert_eq!(components.at(ijk.into()), label, "{ijk:?}");
+        }
+        assert_eq!(components.nearest(DVec3::new(10.0, 0.1, 0.1)), Some(0));
+        assert_eq!(components.nearest(DVec3::new(31.0, 3.0, 0.0)), Some(1));
+        assert_eq!(components.nearest(DVec3::splat(f64::NAN)), None);
+        let pair = block(2, |ijk| if ijk == IVec3::splat(7) || ijk == IVec3::new(7, 8, 8) { -0.5 } else { 0.5 });
+        assert_eq!(pair.components(&RunOptions::default()).unwrap().voxels(), [1, 1]);
+    }
+
+    #[test]
+    fn noise_has_as_many_components_as_measured() {
+        for (seed, inside) in [(1, 0.2), (2, 0.4)] {
+            let level_set = noise(3, seed, inside);
+            let components = level_set.components(&RunOptions::default()).unwrap();
+            let measures = level_set.measure(&RunOptions::default()).unwrap();
+            assert_eq!(components.voxels().len() as u64, measures.components);
+            assert!(components.voxels().is_sorted_by(|a, b| a >= b));
+            // Neighbours along the axes belong together, and every voxel counts once.
+            let mut counts = vec![0; components.voxels().len()];
+            for i in 0..24 * 24 * 24 {
+                let ijk = IVec3::new(i / 576, i / 24 % 24, i % 24);
+                let Some(label) = components.at(ijk) else { continue };
+                counts[label as usize] += 1;
+                assert!(components.at(ijk + IVec3::X).is_none_or(|other| other == label));
+            }
+            assert_eq!(counts, components.voxels());
+        }
     }
 
     #[test]

@@ -191,6 +191,11 @@ impl<'a> IsoSurface<'a> {
         &self.leaves
     }
 
+    /// Place of a leaf among [`leaves`](Self::leaves); `None` for the sentinels and where the surface does not cross it.
+    pub fn place(&self, id: LeafId) -> Option<usize> {
+        self.places.get(id.index()).copied().filter(|&place| place != NO_SURFACE).map(|place| place as usize)
+    }
+
     /// Number of vertices.
     pub fn vertex_count(&self) -> usize {
         self.leaves.last().map_or(0, |leaf| (leaf.first_vertex + leaf.vertices) as usize)

@@ -84,7 +84,7 @@ fn step(axis: usize) -> Corner {
 }
 
 /// The edge along `axis` at a corner; the corner's coordinate along the axis does not matter.
-fn edge_at(axis: usize, corner: Corner) -> Edge {
+pub(crate) fn edge_at(axis: usize, corner: Corner) -> Edge {
     let bit = |a: usize| corner >> (2 - a) & 1;
     let (u, v) = [(1, 2), (0, 2), (0, 1)][axis];
     axis as Edge * 4 + bit(u) * 2 + bit(v)
@@ -116,16 +116,21 @@ fn common_face(a: Edge, b: Edge) -> Option<u8> {
     })
 }
 
-fn derive(pattern: u8) -> CellCase {
+/// The loops of a sign pattern, each as its edges in order.
+///
+/// On the face `turned`, if any, the outside corners are separated where the inside ones would be; it must be ambiguous.
+pub(super) fn loops(pattern: u8, turned: Option<u8>) -> Vec<Vec<Edge>> {
     let inside = |c: Corner| pattern >> c & 1 == 1;
     let mut next: [Option<Edge>; 12] = [None; 12];
     for face in 0..6 {
         let corners = face_corners(face);
+        // Leaving where the run across the diagonal does joins the two inside corners.
+        let skipped = if turned == Some(face) { 2 } else { 0 };
         for i in 0..4 {
             let (before, first) = (corners[(i + 3) % 4], corners[i]);
             if inside(first) && !inside(before) {
                 // The corner before is outside, so the run ends within four steps.
-                let mut last = i;
+                let mut last = i + skipped;
                 while inside(corners[(last + 1) % 4]) {
                     last += 1;
                 }
@@ -134,7 +139,7 @@ fn derive(pattern: u8) -> CellCase {
             }
         }
     }
-    let mut case = CellCase::default();
+    let mut loops = Vec::new();
     for start in 0..12 {
         let mut outline = Vec::new();
         let mut edge = start;
@@ -143,11 +148,32 @@ fn derive(pattern: u8) -> CellCase {
             edge = following;
         }
         if !outline.is_empty() {
-            case.loops += 1;
-            case.crossed |= outline.iter().fold(0, |bits, e| bits | 1 << e);
-            let split = triangulate(&outline, 0, outline.len() - 1);
-            case.triangles.extend(split.unwrap_or_default());
+            loops.push(outline);
         }
+    }
+    loops
+}
+
+/// The face whose two inside corners lie across its diagonal and whose four crossed edges all belong to one loop.
+pub(super) fn doubled_face(pattern: u8) -> Option<u8> {
+    let loops = loops(pattern, None);
+    (0..6).find(|&face| {
+        let corners = face_corners(face);
+        let inside = corners.map(|c| pattern >> c & 1);
+        let ambiguous = inside[0] == inside[2] && inside[1] == inside[3] && inside[0] != inside[1];
+        let mut edges = (0..4).map(|i| edge_between(corners[i], corners[(i + 1) % 4]));
+        let first = loops.iter().find(|outline| outline.contains(&edge_between(corners[0], corners[1])));
+        ambiguous && first.is_some_and(|outline| edges.all(|e| outline.contains(&e)))
+    })
+}
+
+fn derive(pattern: u8) -> CellCase {
+    let mut case = CellCase::default();
+    for outline in loops(pattern, None) {
+        case.loops += 1;
+        case.crossed |= outline.iter().fold(0, |bits, e| bits | 1 << e);
+        let split = triangulate(&outline, 0, outline.len() - 1);
+        case.triangles.extend(split.unwrap_or_default());
     }
     link(&mut case);
     case

@@ -6,11 +6,12 @@
 mod build;
 mod check;
 mod components;
+pub(crate) mod dual;
 pub(crate) mod isosurface;
 mod lattice;
 pub(crate) mod marching;
 mod measure;
-mod sample;
+pub(crate) mod sample;
 pub mod shapes;
 #[cfg(test)]
 pub(crate) mod testing;
@@ -20,6 +21,7 @@ mod violation;
 use glam::{DVec3, IVec3};
 
 pub(crate) use build::grid_of_leaves;
+pub use components::Components;
 pub use measure::Measures;
 pub use sample::Sampler;
 pub use violation::{Violation, ViolationKind};

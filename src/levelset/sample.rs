@@ -38,17 +38,8 @@ impl<'a> Sampler<'a> {
     #[inline]
     pub fn value_and_gradient(&mut self, ijk: DVec3) -> (f32, DVec3) {
         let Some((cell, t)) = split(ijk) else { return (self.level_set.background(), DVec3::ZERO) };
-        let c = self.accessor.cell(cell).map(f64::from);
-        let lerp = |a: f64, b: f64, t: f64| a + (b - a) * t;
-        let z: [f64; 4] = std::array::from_fn(|i| lerp(c[2 * i], c[2 * i + 1], t.z));
-        let y = [lerp(z[0], z[1], t.y), lerp(z[2], z[3], t.y)];
-        let dz: [f64; 4] = std::array::from_fn(|i| c[2 * i + 1] - c[2 * i]);
-        let gradient = DVec3::new(
-            y[1] - y[0],
-            lerp(z[1] - z[0], z[3] - z[2], t.x),
-            lerp(lerp(dz[0], dz[1], t.y), lerp(dz[2], dz[3], t.y), t.x),
-        );
-        (lerp(y[0], y[1], t.x) as f32, gradient / self.level_set.voxel_size())
+        let (phi, gradient) = interpolate(self.accessor.cell(cell), t);
+        (phi as f32, gradient / self.level_set.voxel_size())
     }
 
     /// Central-difference gradient at an index-space position, of the trilinear interpolant with a step of one voxel:
@@ -81,6 +72,22 @@ impl<'a> Sampler<'a> {
         }
         None
     }
+}
+
+/// The trilinear interpolant of the values at a cell's corners (x·4 + y·2 + z) at `t` in 0..1, and its gradient.
+#[inline]
+pub(crate) fn interpolate(corners: [f32; 8], t: DVec3) -> (f64, DVec3) {
+    let c = corners.map(f64::from);
+    let lerp = |a: f64, b: f64, t: f64| a + (b - a) * t;
+    let z: [f64; 4] = std::array::from_fn(|i| lerp(c[2 * i], c[2 * i + 1], t.z));
+    let y = [lerp(z[0], z[1], t.y), lerp(z[2], z[3], t.y)];
+    let dz: [f64; 4] = std::array::from_fn(|i| c[2 * i + 1] - c[2 * i]);
+    let gradient = DVec3::new(
+        y[1] - y[0],
+        lerp(z[1] - z[0], z[3] - z[2], t.x),
+        lerp(lerp(dz[0], dz[1], t.y), lerp(dz[2], dz[3], t.y), t.x),
+    );
+    (lerp(y[0], y[1], t.x), gradient)
 }
 
 /// The cell and the position in it; `None` where the position is not finite or too far away for an index.

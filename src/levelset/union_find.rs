@@ -21,7 +21,7 @@ impl UnionFind {
     }
 
     /// The smallest number known to be in the set of `i`.
-    fn root(&self, mut i: u32) -> u32 {
+    pub fn root(&self, mut i: u32) -> u32 {
         loop {
             let parent = self.parent(i).load(Ordering::Relaxed);
             if parent == i {

@@ -22,15 +22,7 @@ const OPERATION: &str = "level set to mesh";
 /// Refused where the surface leaves the stored band: such a mesh would have holes. Surfaces that lie between absent
 /// leaves altogether are not seen; [`LevelSet::check`] finds both.
 pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Result<TriangleMesh> {
-    let grid = level_set.grid();
-    let background = grid.background();
-    if iso.is_nan() || iso.abs() >= background {
-        return Err(EditError::parameter(OPERATION, "iso", iso, format!("above -{background} and below {background}")));
-    }
-    let surface = IsoSurface::new(grid, iso, OPERATION, run)?;
-    if let Some(ijk) = grid.map_leaves(|id| surface.leak(id)).into_iter().flatten().next() {
-        return Err(leaves_the_band(format!("at voxel {ijk}")));
-    }
+    let surface = surface_of(level_set, iso, OPERATION, run)?;
     let leaves = surface.leaves();
     let triangle_count: usize = leaves.iter().map(|leaf| leaf.triangles as usize).sum();
     let bytes = surface.vertex_count() * size_of::<DVec3>() + triangle_count * size_of::<[u32; 3]>();
@@ -63,13 +55,33 @@ pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Re
     if complete {
         Ok(TriangleMesh { positions, triangles, ..TriangleMesh::default() })
     } else {
-        Err(leaves_the_band("between leaves".into()))
+        Err(leaves_the_band(OPERATION, "between leaves"))
     }
 }
 
-fn leaves_the_band(place: String) -> EditError {
+/// The surface φ = `iso` for `operation`; refused where it leaves the stored leaves.
+pub(super) fn surface_of<'a>(
+    level_set: &'a LevelSet,
+    iso: f32,
+    operation: &str,
+    run: &RunOptions,
+) -> Result<IsoSurface<'a>> {
+    let grid = level_set.grid();
+    let background = grid.background();
+    if iso.is_nan() || iso.abs() >= background {
+        return Err(EditError::parameter(operation, "iso", iso, format!("above -{background} and below {background}")));
+    }
+    let surface = IsoSurface::new(grid, iso, operation, run)?;
+    match grid.map_leaves(|id| surface.leak(id)).into_iter().flatten().next() {
+        Some(ijk) => Err(leaves_the_band(operation, &format!("at voxel {ijk}"))),
+        None => Ok(surface),
+    }
+}
+
+/// The error of a level set whose surface cannot be followed.
+pub(super) fn leaves_the_band(operation: &str, place: &str) -> EditError {
     EditError::NotALevelSet {
-        operation: OPERATION.into(),
+        operation: operation.into(),
         name: "level set".into(),
         problem: format!("the surface leaves the stored band {place}; rebuild it, or use --repair"),
     }
@@ -117,45 +129,11 @@ mod tests {
     use super::*;
     use crate::grid::Transform;
     use crate::levelset::testing::{ball, block, noise, sampled, torus};
+    use crate::mesh::testing::{area_and_volume, assert_manifold};
     use glam::IVec3;
-    use std::collections::HashMap;
 
     fn mesh(level_set: &LevelSet) -> TriangleMesh {
         level_set_to_mesh(level_set, 0.0, &RunOptions::default()).unwrap()
-    }
-
-    /// Asserts that every edge joins two triangles in opposite directions and that the triangles around every vertex
-    /// form one ring, that no triangle is degenerate, and returns V − E + F.
-    fn assert_manifold(mesh: &TriangleMesh) -> i64 {
-        let mut sides = HashMap::new();
-        let mut around = vec![Vec::new(); mesh.positions.len()];
-        for (t, &[a, b, c]) in mesh.triangles.iter().enumerate() {
-            for (from, to, apex) in [(a, b, c), (b, c, a), (c, a, b)] {
-                assert!(sides.insert((from, to), apex).is_none(), "edge {from}-{to} is used twice in one direction");
-                around[from as usize].push((to, apex));
-            }
-            let [p, q, r] = mesh.corners(t);
-            assert!((q - p).cross(r - p).length() > 0.0, "triangle {t} has no area");
-        }
-        assert!(sides.keys().all(|&(from, to)| sides.contains_key(&(to, from))), "open edge");
-        for (v, fan) in around.iter().enumerate() {
-            let next: HashMap<u32, u32> = fan.iter().copied().collect();
-            let start = fan.first().unwrap_or_else(|| panic!("vertex {v} is not used")).0;
-            let (mut at, mut steps) = (next[&start], 1);
-            while at != start {
-                at = next[&at];
-                steps += 1;
-            }
-            assert_eq!(steps, fan.len(), "vertex {v} joins several sheets");
-        }
-        mesh.positions.len() as i64 - sides.len() as i64 / 2 + mesh.triangles.len() as i64
-    }
-
-    /// Area and volume, by the textbook.
-    fn area_and_volume(mesh: &TriangleMesh) -> (f64, f64) {
-        (0..mesh.triangles.len()).map(|t| mesh.corners(t)).fold((0.0, 0.0), |(area, volume), [a, b, c]| {
-            (area + (b - a).cross(c - a).length() / 2.0, volume + a.dot(b.cross(c)) / 6.0)
-        })
     }
 
     #[test]

@@ -1,36 +1,33 @@
 //! Triangle meshes: files, and the way to a level set and back.
 
-mod build;
+mod attributes;
 mod bvh;
 mod closest;
-mod color;
 pub mod files;
 mod findings;
 mod from_levelset;
-mod gltf;
-mod gltf_write;
-mod obj;
-mod off;
-mod ply;
-mod polygon;
 mod prepare;
+mod quads;
 mod rebuild;
 mod scatter;
-mod stl;
+mod simplify;
 #[cfg(test)]
 mod testing;
-mod text;
 mod to_levelset;
 mod topology;
+mod unit;
 mod winding;
 
+pub use attributes::{Attributes, transfer_attributes};
 pub use bvh::{Bvh, Hit};
-pub use files::{MeshFormat, ReadMesh, read, write, write_to};
+pub use files::{MeshFormat, ReadMesh, read, write, write_quads, write_to};
 pub use findings::MeshFindings;
 pub use from_levelset::level_set_to_mesh;
 pub use prepare::prepare;
+pub use quads::{QuadMesh, level_set_to_quads};
 pub use rebuild::{Rebuild, onto_lattice, rebuild, with_half_width};
 pub use scatter::{UnsignedLeaf, distance_to_triangles};
+pub use simplify::{Bound, Simplified, simplify};
 pub use to_levelset::{MeshToLevelSet, mesh_to_level_set};
 pub use topology::{Topology, analyze};
 pub use winding::WindingNumber;

@@ -1,5 +1,7 @@
 //! Small meshes with known geometry, and a reader of the shared test data, for the unit tests of this module.
 
+use std::collections::HashMap;
+
 use glam::DVec3;
 
 use super::TriangleMesh;
@@ -58,6 +60,40 @@ pub(crate) fn joined(mut a: TriangleMesh, b: &TriangleMesh) -> TriangleMesh {
 pub(crate) fn reversed(mut mesh: TriangleMesh) -> TriangleMesh {
     mesh.triangles.iter_mut().for_each(|t| t.swap(1, 2));
     mesh
+}
+
+/// Asserts that every edge joins two triangles in opposite directions and that the triangles around every vertex
+/// form one ring, that no triangle is degenerate, and returns V − E + F.
+pub(crate) fn assert_manifold(mesh: &TriangleMesh) -> i64 {
+    let mut sides = HashMap::new();
+    let mut around = vec![Vec::new(); mesh.positions.len()];
+    for (t, &[a, b, c]) in mesh.triangles.iter().enumerate() {
+        for (from, to, apex) in [(a, b, c), (b, c, a), (c, a, b)] {
+            assert!(sides.insert((from, to), apex).is_none(), "edge {from}-{to} is used twice in one direction");
+            around[from as usize].push((to, apex));
+        }
+        let [p, q, r] = mesh.corners(t);
+        assert!((q - p).cross(r - p).length() > 0.0, "triangle {t} has no area");
+    }
+    assert!(sides.keys().all(|&(from, to)| sides.contains_key(&(to, from))), "open edge");
+    for (v, fan) in around.iter().enumerate() {
+        let next: HashMap<u32, u32> = fan.iter().copied().collect();
+        let start = fan.first().unwrap_or_else(|| panic!("vertex {v} is not used")).0;
+        let (mut at, mut steps) = (next[&start], 1);
+        while at != start {
+            at = next[&at];
+            steps += 1;
+        }
+        assert_eq!(steps, fan.len(), "vertex {v} joins several sheets");
+    }
+    mesh.positions.len() as i64 - sides.len() as i64 / 2 + mesh.triangles.len() as i64
+}
+
+/// Area and volume, by the textbook.
+pub(crate) fn area_and_volume(mesh: &TriangleMesh) -> (f64, f64) {
+    (0..mesh.triangles.len()).map(|t| mesh.corners(t)).fold((0.0, 0.0), |(area, volume), [a, b, c]| {
+        (area + (b - a).cross(c - a).length() / 2.0, volume + a.dot(b.cross(c)) / 6.0)
+    })
 }
 
 /// A repeatable number in 0..1: tests need variety, not randomness.

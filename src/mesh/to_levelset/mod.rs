@@ -181,7 +181,7 @@ fn sign(
 }
 
 /// Refuses indices out of range and positions that are no numbers.
-fn check_numbers(mesh: &TriangleMesh) -> Result<()> {
+pub(super) fn check_numbers(mesh: &TriangleMesh) -> Result<()> {
     let vertices = mesh.positions.len();
     if let Some((t, v)) = (0..)
         .zip(&mesh.triangles)

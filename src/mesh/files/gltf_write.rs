@@ -15,7 +15,7 @@ use gltf::mesh::Mode;
 use rustc_hash::FxHashMap;
 
 use super::TriangleMesh;
-use super::files::unwritable;
+use super::unwritable;
 
 /// Writes the binary form.
 pub(super) fn write_glb(out: &mut dyn Write, mesh: &TriangleMesh) -> io::Result<()> {

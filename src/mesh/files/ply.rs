@@ -17,7 +17,7 @@ use ply_rs_bw::ply::{DefaultElement, ElementDef, Encoding, PropertyType, ScalarT
 
 use super::build::MeshBuilder;
 use super::text::{number, show};
-use super::{ReadMesh, TriangleMesh, color};
+use super::{Polygons, ReadMesh, color};
 use crate::Result;
 
 /// The body of the file: a stream of scalars in one of the encodings.
@@ -311,7 +311,7 @@ fn refuse_at(builder: &MeshBuilder, body: &Body, problem: &str) -> crate::EditEr
     builder.refuse(format!("{}: {problem}", body.place()))
 }
 
-pub(super) fn write(out: &mut dyn Write, mesh: &TriangleMesh) -> io::Result<()> {
+pub(super) fn write<const N: usize>(out: &mut dyn Write, mesh: &Polygons<N>) -> io::Result<()> {
     // Single precision where nothing is lost by it.
     let single = mesh.positions.iter().all(|p| p.as_vec3().as_dvec3() == *p);
     let real = if single { "float" } else { "double" };
@@ -325,7 +325,7 @@ pub(super) fn write(out: &mut dyn Write, mesh: &TriangleMesh) -> io::Result<()> 
     }
     // Signed indices are what the oldest readers expect.
     let index = if mesh.positions.len() <= i32::MAX as usize { "int" } else { "uint" };
-    writeln!(out, "element face {}\nproperty list uchar {index} vertex_indices\nend_header", mesh.triangles.len())?;
+    writeln!(out, "element face {}\nproperty list uchar {index} vertex_indices\nend_header", mesh.faces.len())?;
     for (v, p) in mesh.positions.iter().enumerate() {
         for x in p.to_array() {
             match single {
@@ -333,16 +333,16 @@ pub(super) fn write(out: &mut dyn Write, mesh: &TriangleMesh) -> io::Result<()> 
                 false => out.write_all(&x.to_le_bytes())?,
             }
         }
-        if let Some(colors) = &mesh.colors {
+        if let Some(colors) = mesh.colors {
             out.write_all(&color::encode_bytes(colors[v]))?;
         }
-        if let Some(uvs) = &mesh.uvs {
+        if let Some(uvs) = mesh.uvs {
             out.write_all(uvs[v].map(f32::to_le_bytes).as_flattened())?;
         }
     }
-    for triangle in &mesh.triangles {
-        out.write_all(&[3])?;
-        out.write_all(triangle.map(u32::to_le_bytes).as_flattened())?;
+    for face in mesh.faces {
+        out.write_all(&[N as u8])?;
+        out.write_all(face.map(u32::to_le_bytes).as_flattened())?;
     }
     Ok(())
 }

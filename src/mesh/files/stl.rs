@@ -14,8 +14,8 @@ use glam::DVec3;
 use rustc_hash::FxHashMap;
 
 use super::build::MeshBuilder;
-use super::files::unwritable;
 use super::text::{lines, number, show, words};
+use super::unwritable;
 use super::{ReadMesh, TriangleMesh};
 use crate::Result;
 

@@ -21,7 +21,7 @@ use gltf::scene::Transform;
 use gltf::{Accessor, Document, Gltf, Primitive, Semantic};
 
 use super::build::MeshBuilder;
-use super::files::read_beside;
+use super::read_beside;
 use super::{ReadMesh, color};
 use crate::{EditError, Result};
 

@@ -13,7 +13,7 @@ use glam::DVec3;
 
 use super::build::MeshBuilder;
 use super::text::{lines, number, show, words};
-use super::{ReadMesh, TriangleMesh, color};
+use super::{Polygons, ReadMesh, color};
 use crate::Result;
 
 /// Which columns a vertex has behind its position.
@@ -160,22 +160,26 @@ fn rgba(words: &[&[u8]]) -> Result<[f32; 4], String> {
     Ok(color::decode(color))
 }
 
-pub(super) fn write(out: &mut dyn Write, mesh: &TriangleMesh) -> io::Result<()> {
+pub(super) fn write<const N: usize>(out: &mut dyn Write, mesh: &Polygons<N>) -> io::Result<()> {
     let kind = (if mesh.uvs.is_some() { "ST" } else { "" }, if mesh.colors.is_some() { "C" } else { "" });
-    writeln!(out, "{}{}OFF\n{} {} 0", kind.0, kind.1, mesh.positions.len(), mesh.triangles.len())?;
+    writeln!(out, "{}{}OFF\n{} {} 0", kind.0, kind.1, mesh.positions.len(), mesh.faces.len())?;
     for (v, p) in mesh.positions.iter().enumerate() {
         write!(out, "{:?} {:?} {:?}", p.x, p.y, p.z)?;
-        if let Some(colors) = &mesh.colors {
+        if let Some(colors) = mesh.colors {
             let [r, g, b, a] = color::encode_bytes(colors[v]);
             write!(out, " {r} {g} {b} {a}")?;
         }
-        if let Some(uvs) = &mesh.uvs {
+        if let Some(uvs) = mesh.uvs {
             write!(out, " {:?} {:?}", uvs[v][0], uvs[v][1])?;
         }
         writeln!(out)?;
     }
-    for [a, b, c] in &mesh.triangles {
-        writeln!(out, "3 {a} {b} {c}")?;
+    for face in mesh.faces {
+        write!(out, "{N}")?;
+        for v in face {
+            write!(out, " {v}")?;
+        }
+        writeln!(out)?;
     }
     Ok(())
 }

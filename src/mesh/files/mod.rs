@@ -8,12 +8,25 @@
 //! | `.glb`, `.gltf` | the default scene with its transforms | with normals |
 //! | `.off` | OFF, COFF, NOFF, STOFF as text | text |
 
+mod build;
+mod color;
+mod gltf;
+mod gltf_write;
+mod obj;
+mod off;
+mod ply;
+mod polygon;
+mod stl;
+mod text;
+
 use std::ffi::OsStr;
 use std::fmt;
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::{TriangleMesh, gltf, gltf_write, obj, off, ply, stl};
+use glam::DVec3;
+
+use super::{QuadMesh, TriangleMesh};
 use crate::atomic::write_atomically;
 use crate::{EditError, Result};
 
@@ -59,6 +72,16 @@ impl MeshFormat {
         }
     }
 
+    /// Whether faces may have four corners and more.
+    pub fn has_polygons(self) -> bool {
+        matches!(self, Self::Obj | Self::Ply | Self::Off)
+    }
+
+    /// Whether vertices may have colours and texture coordinates.
+    pub fn has_attributes(self) -> bool {
+        self != Self::Stl
+    }
+
     /// The format of a path by its extension, in upper or lower case.
     pub fn of(path: &Path) -> Option<Self> {
         let extension = path.extension().and_then(OsStr::to_str)?;
@@ -98,26 +121,92 @@ pub fn read(path: &Path) -> Result<ReadMesh> {
 /// An unknown extension is an [`EditError::Parameter`], a mesh that the format cannot hold and every failure of the disk
 /// an [`EditError::Output`].
 pub fn write(path: &Path, mesh: &TriangleMesh) -> Result<()> {
-    let format = MeshFormat::of(path)
-        .ok_or_else(|| EditError::parameter("write mesh", "path", path.display(), unknown_extension()))?;
+    let format = format_to_write(path)?;
     write_atomically(path, |out| write_to(out, format, mesh))
 }
 
 /// Writes a mesh in `format`. A mesh that the format cannot hold is [`io::ErrorKind::InvalidInput`].
 pub fn write_to(out: &mut dyn Write, format: MeshFormat, mesh: &TriangleMesh) -> io::Result<()> {
-    check(mesh).map_err(unwritable)?;
+    let polygons = Polygons::from(mesh);
+    polygons.check().map_err(unwritable)?;
     match format {
-        MeshFormat::Obj => obj::write(out, mesh),
-        MeshFormat::Ply => ply::write(out, mesh),
+        MeshFormat::Obj => obj::write(out, &polygons),
+        MeshFormat::Ply => ply::write(out, &polygons),
         MeshFormat::Stl => stl::write(out, mesh),
         MeshFormat::Glb => gltf_write::write_glb(out, mesh),
         MeshFormat::Gltf => gltf_write::write_gltf(out, mesh),
-        MeshFormat::Off => off::write(out, mesh),
+        MeshFormat::Off => off::write(out, &polygons),
+    }
+}
+
+/// Writes a mesh of quads, like [`write`]: as quads where the format [has polygons](MeshFormat::has_polygons), else in
+/// triangles.
+pub fn write_quads(path: &Path, mesh: &QuadMesh) -> Result<()> {
+    let polygons = Polygons::from(mesh);
+    let writer: fn(&mut dyn Write, &Polygons<4>) -> io::Result<()> = match format_to_write(path)? {
+        MeshFormat::Obj => obj::write,
+        MeshFormat::Ply => ply::write,
+        MeshFormat::Off => off::write,
+        MeshFormat::Stl | MeshFormat::Glb | MeshFormat::Gltf => {
+            polygons.check().map_err(|problem| EditError::output(path, problem))?;
+            return write(path, &mesh.clone().into_triangles());
+        }
+    };
+    write_atomically(path, |out| {
+        polygons.check().map_err(unwritable)?;
+        writer(out, &polygons)
+    })
+}
+
+fn format_to_write(path: &Path) -> Result<MeshFormat> {
+    MeshFormat::of(path).ok_or_else(|| EditError::parameter("write mesh", "path", path.display(), unknown_extension()))
+}
+
+/// What is written: vertices, and faces of N corners.
+struct Polygons<'a, const N: usize> {
+    positions: &'a [DVec3],
+    faces: &'a [[u32; N]],
+    colors: Option<&'a [[f32; 4]]>,
+    uvs: Option<&'a [[f32; 2]]>,
+}
+
+impl<'a> From<&'a TriangleMesh> for Polygons<'a, 3> {
+    fn from(mesh: &'a TriangleMesh) -> Self {
+        let (colors, uvs) = (mesh.colors.as_deref(), mesh.uvs.as_deref());
+        Self { positions: &mesh.positions, faces: &mesh.triangles, colors, uvs }
+    }
+}
+
+impl<'a> From<&'a QuadMesh> for Polygons<'a, 4> {
+    fn from(mesh: &'a QuadMesh) -> Self {
+        let (colors, uvs) = (mesh.colors.as_deref(), mesh.uvs.as_deref());
+        Self { positions: &mesh.positions, faces: &mesh.quads, colors, uvs }
+    }
+}
+
+impl<const N: usize> Polygons<'_, N> {
+    /// The fields of a mesh are public: nothing is taken for granted before it is written.
+    fn check(&self) -> Result<(), String> {
+        let vertices = self.positions.len();
+        let attributes = [("colors", self.colors.map(<[_]>::len)), ("uvs", self.uvs.map(<[_]>::len))];
+        for (name, count) in attributes {
+            if let Some(count) = count.filter(|&count| count != vertices) {
+                return Err(format!("the mesh has {vertices} vertices but {count} {name}"));
+            }
+        }
+        let faces = self.faces.iter().enumerate();
+        if let Some((f, v)) = faces.flat_map(|(f, c)| c.map(|v| (f, v))).find(|&(_, v)| v as usize >= vertices) {
+            return Err(format!("face {f} uses vertex {v}, but there are {vertices}"));
+        }
+        match self.positions.iter().position(|p| !p.is_finite()) {
+            Some(v) => Err(format!("vertex {v} is not finite: {}", self.positions[v])),
+            None => Ok(()),
+        }
     }
 }
 
 /// A file that another one names, relative to it. What is no regular file (a device never ends) is not followed.
-pub(super) fn read_beside(path: &Path, name: &str) -> io::Result<Vec<u8>> {
+fn read_beside(path: &Path, name: &str) -> io::Result<Vec<u8>> {
     let beside = path.with_file_name(name);
     if Path::new(name).is_absolute() || !std::fs::metadata(&beside)?.is_file() {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "not a file beside it"));
@@ -126,28 +215,8 @@ pub(super) fn read_beside(path: &Path, name: &str) -> io::Result<Vec<u8>> {
 }
 
 /// The error of a mesh that a format cannot hold.
-pub(super) fn unwritable(problem: String) -> io::Error {
+fn unwritable(problem: String) -> io::Error {
     io::Error::new(io::ErrorKind::InvalidInput, problem)
-}
-
-/// The fields of a mesh are public: nothing is taken for granted before it is written.
-fn check(mesh: &TriangleMesh) -> Result<(), String> {
-    let vertices = mesh.positions.len();
-    let attributes = [("colors", mesh.colors.as_ref().map(Vec::len)), ("uvs", mesh.uvs.as_ref().map(Vec::len))];
-    for (name, count) in attributes {
-        if let Some(count) = count.filter(|&count| count != vertices) {
-            return Err(format!("the mesh has {vertices} vertices but {count} {name}"));
-        }
-    }
-    if let Some((t, v)) =
-        mesh.triangles.iter().enumerate().find_map(|(t, c)| c.iter().find(|&&v| v as usize >= vertices).map(|v| (t, v)))
-    {
-        return Err(format!("triangle {t} uses vertex {v}, but there are {vertices}"));
-    }
-    match mesh.positions.iter().position(|p| !p.is_finite()) {
-        Some(v) => Err(format!("vertex {v} is not finite: {}", mesh.positions[v])),
-        None => Ok(()),
-    }
 }
 
 fn unknown_extension() -> String {
@@ -158,7 +227,6 @@ fn unknown_extension() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DVec3;
 
     fn triangle() -> TriangleMesh {
         TriangleMesh {
@@ -191,7 +259,7 @@ mod tests {
         mesh.positions.push(DVec3::new(0.1f32.into(), -2.5, 1e6));
         mesh.triangles.push([1, 3, 2]);
         let bytes = [[0, 127, 255, 255], [9, 8, 7, 255], [255, 0, 0, 255], [1, 2, 3, 255]];
-        let colors = bytes.map(|c: [u8; 4]| super::super::color::decode(c.map(|c| f32::from(c) / 255.0)));
+        let colors = bytes.map(|c: [u8; 4]| super::color::decode(c.map(|c| f32::from(c) / 255.0)));
         mesh.colors = Some(colors.to_vec());
         mesh.uvs = Some(vec![[0.0, 0.0], [0.25, 0.0], [0.0, 0.75], [1.5, -1.0]]);
         for format in MeshFormat::ALL {
@@ -210,6 +278,34 @@ mod tests {
             let (back, expected) = (colors(&back.mesh), colors(&expected));
             assert_eq!(back.len(), expected.len(), "{format}");
             assert!(back.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-6), "{format}");
+        }
+    }
+
+    #[test]
+    fn quads_stay_quads_where_there_are_polygons() {
+        let folder = tempfile::tempdir().unwrap();
+        let positions = vec![DVec3::ZERO, DVec3::X, DVec3::new(1.0, 1.0, 0.0), DVec3::Y];
+        let uvs = Some(vec![[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]);
+        let mesh = QuadMesh { positions, quads: vec![[0, 1, 2, 3]], uvs, colors: None };
+        for format in MeshFormat::ALL {
+            let path = folder.path().join("a").with_extension(format.extension());
+            write_quads(&path, &mesh).unwrap();
+            let back = read(&path).unwrap().mesh;
+            assert_eq!((back.positions.len(), back.triangles.len()), (4, 2), "{format}");
+            assert_eq!(back.uvs.is_some(), format.has_attributes(), "{format}");
+            let bytes = std::fs::read(&path).unwrap();
+            let said = String::from_utf8_lossy(&bytes);
+            match format {
+                MeshFormat::Obj => assert!(said.contains("\nf 1/1 2/2 3/3 4/4\n"), "{said}"),
+                MeshFormat::Off => assert!(said.contains("\n4 0 1 2 3\n"), "{said}"),
+                MeshFormat::Ply => assert!(said.contains("element face 1\n"), "{said}"),
+                _ => assert!(!format.has_polygons()),
+            }
+        }
+        let broken = QuadMesh { quads: vec![[0, 1, 2, 4]], ..mesh };
+        for format in [MeshFormat::Off, MeshFormat::Stl] {
+            let path = folder.path().join("b").with_extension(format.extension());
+            assert_eq!(write_quads(&path, &broken).unwrap_err().exit_code(), 4);
         }
     }
 

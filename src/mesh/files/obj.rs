@@ -17,9 +17,9 @@ use glam::DVec3;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::build::MeshBuilder;
-use super::files::read_beside;
+use super::read_beside;
 use super::text::{lines, number, show, words};
-use super::{ReadMesh, TriangleMesh, color};
+use super::{Polygons, ReadMesh, color};
 use crate::Result;
 
 /// In place of an index that a corner does not give.
@@ -244,27 +244,30 @@ fn material_names(library: &[u8]) -> impl Iterator<Item = Vec<u8>> {
     })
 }
 
-pub(super) fn write(out: &mut dyn Write, mesh: &TriangleMesh) -> io::Result<()> {
-    writeln!(out, "# vdb-edit: {} vertices, {} triangles", mesh.positions.len(), mesh.triangles.len())?;
+pub(super) fn write<const N: usize>(out: &mut dyn Write, mesh: &Polygons<N>) -> io::Result<()> {
+    writeln!(out, "# vdb-edit: {} vertices, {} faces", mesh.positions.len(), mesh.faces.len())?;
     for (v, p) in mesh.positions.iter().enumerate() {
         // Debug prints the shortest number that reads back the same, with an exponent where zeros would fill the line.
         write!(out, "v {:?} {:?} {:?}", p.x, p.y, p.z)?;
-        if let Some(colors) = &mesh.colors {
+        if let Some(colors) = mesh.colors {
             let [r, g, b, _] = colors[v];
             let [r, g, b] = [r, g, b].map(color::to_srgb);
             write!(out, " {r:?} {g:?} {b:?}")?;
         }
         writeln!(out)?;
     }
-    for [u, v] in mesh.uvs.iter().flatten() {
+    for [u, v] in mesh.uvs.iter().copied().flatten() {
         writeln!(out, "vt {u:?} {v:?}")?;
     }
-    for triangle in &mesh.triangles {
-        let [a, b, c] = triangle.map(|v| u64::from(v) + 1);
-        match mesh.uvs {
-            Some(_) => writeln!(out, "f {a}/{a} {b}/{b} {c}/{c}")?,
-            None => writeln!(out, "f {a} {b} {c}")?,
+    for face in mesh.faces {
+        out.write_all(b"f")?;
+        for v in face.map(|v| u64::from(v) + 1) {
+            match mesh.uvs {
+                Some(_) => write!(out, " {v}/{v}")?,
+                None => write!(out, " {v}")?,
+            }
         }
+        writeln!(out)?;
     }
     Ok(())
 }

@@ -1,0 +1,185 @@
+//! How a result becomes a mesh file: which faces, how many, and what their vertices carry.
+
+use std::path::{Path, PathBuf};
+
+use clap::ArgMatches;
+use serde_json::{Map, Value};
+
+use super::context::Context;
+use super::output::Written;
+use super::{args, input};
+use crate::error::{EditError, Result};
+use crate::levelset::LevelSet;
+use crate::mesh::{
+    self, Attributes, Bound, MeshFormat, TriangleMesh, level_set_to_mesh, level_set_to_quads, simplify,
+    transfer_attributes,
+};
+
+/// The options of a mesh.
+#[derive(Default)]
+pub struct MeshOptions {
+    faces: Faces,
+    /// `--attributes-from`.
+    attributes: Option<(PathBuf, TriangleMesh)>,
+    warnings: Vec<String>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+enum Faces {
+    /// The triangles of marching cubes.
+    #[default]
+    All,
+    /// `--simplify`: this part of them.
+    Part(f64),
+    /// `--adaptivity`: as few as stay within this many voxels.
+    Within(f64),
+    /// `--quads`.
+    Quads,
+}
+
+impl MeshOptions {
+    /// From the options of a command that writes to `path`: refused if that is no mesh, or cannot hold what is asked.
+    pub fn new(matches: &ArgMatches, path: &Path) -> Result<Self> {
+        let number = |id: &str| matches.try_get_one::<f64>(id).ok().flatten().copied();
+        let faces = match (number("simplify"), number("adaptivity")) {
+            (Some(ratio), _) => Faces::Part(ratio),
+            (None, Some(voxels)) => Faces::Within(voxels),
+            (None, None) if args::flag(matches, "quads") => Faces::Quads,
+            (None, None) => Faces::All,
+        };
+        let source = args::paths(matches, "attributes-from").pop();
+        let format = MeshFormat::of(path);
+        let refuse = |field: &str, value: String, accepted: &str| {
+            Err(EditError::parameter("vdb-edit", field, value, accepted.to_owned()))
+        };
+        let is_mesh = format.is_some() && !input::is_volume(path);
+        let accepted = "an output that is a mesh (.obj, .ply, .stl, .glb, .gltf or .off)";
+        match faces {
+            Faces::Part(ratio) if !is_mesh => return refuse("simplify", ratio.to_string(), accepted),
+            Faces::Within(voxels) if !is_mesh => return refuse("adaptivity", voxels.to_string(), accepted),
+            Faces::Quads if !is_mesh => return refuse("quads", "true".into(), accepted),
+            _ => {}
+        }
+        let mut warnings = Vec::new();
+        let attributes = match source {
+            None => None,
+            Some(source) if !is_mesh || format.is_some_and(|format| !format.has_attributes()) => {
+                let accepted =
+                    "an output that can hold colours and texture coordinates (.obj, .ply, .glb, .gltf or .off)";
+                return refuse("attributes_from", source.display().to_string(), accepted);
+            }
+            Some(source) => {
+                let mesh = input::read_mesh(&source, &mut warnings)?;
+                if attributes_of(&mesh).is_none() {
+                    return Err(EditError::input(source, "has neither colours nor texture coordinates"));
+                }
+                Some((source, mesh))
+            }
+        };
+        Ok(Self { faces, attributes, warnings })
+    }
+
+    /// Whether a mesh as it stands in a file is not enough.
+    pub fn needs_level_set(&self) -> bool {
+        matches!(self.faces, Faces::Within(_) | Faces::Quads)
+    }
+
+    /// What becomes of the attributes of an input, if they do not come through to `path`.
+    pub fn loss(&self, input: &Path, attributes: &str, path: &Path) -> Option<String> {
+        if self.attributes.is_some() {
+            return None;
+        }
+        let input = input.display();
+        Some(match MeshFormat::of(path) {
+            Some(format) if !format.has_attributes() => {
+                format!("{input}: its {attributes} are lost: {format} files hold none")
+            }
+            Some(_) => format!("{input}: its {attributes} are lost; --attributes-from {input} keeps them"),
+            None => format!(
+                "{input}: its {attributes} are lost: a level set has none; --attributes-from {input} brings them back when a mesh is written"
+            ),
+        })
+    }
+
+    /// Writes the surface φ = `iso`.
+    pub fn write_level_set(&self, path: &Path, level_set: &LevelSet, iso: f32, context: &Context) -> Result<Written> {
+        if self.faces != Faces::Quads {
+            return self.write_triangles(
+                path,
+                level_set_to_mesh(level_set, iso, &context.run)?,
+                level_set.voxel_size(),
+                context,
+            );
+        }
+        let mut mesh = level_set_to_quads(level_set, iso, &context.run)?;
+        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, context)? {
+            (mesh.colors, mesh.uvs) = (colors, uvs);
+        }
+        mesh::write_quads(path, &mesh)?;
+        let mut warnings = self.warnings.clone();
+        let format = MeshFormat::of(path);
+        if let Some(format) = format.filter(|format| !format.has_polygons()) {
+            warnings.push(format!("{format} files hold triangles only: each quad was split in two"));
+        }
+        let details = counts(&[("vertices", mesh.positions.len()), ("quads", mesh.quads.len())]);
+        Ok(Written { bytes: size(path), warnings, details })
+    }
+
+    /// Writes a mesh that came from a file.
+    pub fn write_mesh(&self, path: &Path, mesh: TriangleMesh, context: &Context) -> Result<Written> {
+        self.write_triangles(path, mesh, 1.0, context)
+    }
+
+    fn write_triangles(
+        &self,
+        path: &Path,
+        mut mesh: TriangleMesh,
+        voxel_size: f64,
+        context: &Context,
+    ) -> Result<Written> {
+        let mut warnings = self.warnings.clone();
+        let mut details = Map::new();
+        let bound = match self.faces {
+            Faces::Part(ratio) => Some(Bound::Ratio(ratio)),
+            Faces::Within(voxels) if voxels > 0.0 => Some(Bound::Distance(voxels * voxel_size)),
+            _ => None,
+        };
+        if let Some(bound) = bound {
+            let simplified = simplify(&mesh, bound, &context.run)?;
+            details.insert("triangles_before".into(), mesh.triangles.len().into());
+            details.insert("deviation".into(), simplified.deviation.into());
+            warnings.extend(simplified.warnings);
+            mesh = simplified.mesh;
+        }
+        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, context)? {
+            (mesh.colors, mesh.uvs) = (colors, uvs);
+        }
+        mesh::write(path, &mesh)?;
+        details.extend(counts(&[("vertices", mesh.positions.len()), ("triangles", mesh.triangles.len())]));
+        Ok(Written { bytes: size(path), warnings, details })
+    }
+
+    fn attributes(&self, positions: &[glam::DVec3], context: &Context) -> Result<Option<Attributes>> {
+        let Some((path, source)) = &self.attributes else { return Ok(None) };
+        let found = transfer_attributes(source, positions, &context.run);
+        found.map(Some).map_err(|error| input::naming(path, error))
+    }
+}
+
+/// What the vertices of a mesh carry, in words.
+pub fn attributes_of(mesh: &TriangleMesh) -> Option<&'static str> {
+    match (mesh.colors.is_some(), mesh.uvs.is_some()) {
+        (true, true) => Some("colours and texture coordinates"),
+        (true, false) => Some("colours"),
+        (false, true) => Some("texture coordinates"),
+        (false, false) => None,
+    }
+}
+
+fn counts(counts: &[(&str, usize)]) -> Map<String, Value> {
+    counts.iter().map(|(name, count)| ((*name).to_owned(), Value::from(*count))).collect()
+}
+
+fn size(path: &Path) -> Option<u64> {
+    std::fs::metadata(path).ok().map(|m| m.len())
+}
