@@ -120,13 +120,14 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
                             let a = load(simd, alpha, at);
                             value = (Lanes::splat(simd, 1.0) - a) * load(simd, phi, at) + a * value;
                         }
-                        let before = load(simd, out, at);
+                        let now = load(simd, phi, at);
                         if self.blend.old != 0.0 {
-                            let old = self.old.map_or(before, |buffer| load(simd, buffer.get(id), at));
+                            let old = load(simd, self.old.map_or(&*out, |buffer| buffer.get(id)), at);
                             value = old * self.blend.old + value * self.blend.new;
                         }
+                        // The other voxels of the rows take φ's value: so trimmed ones need no care of their own.
                         let mask = mask32x16::from_bitmask(simd, u64::from(bits));
-                        mask.select(value, before).store_slice(&mut out.0[at..at + 16]);
+                        mask.select(value, now).store_slice(&mut out.0[at..at + 16]);
                     },
                 );
             },

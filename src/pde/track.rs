@@ -6,7 +6,7 @@ use super::SolverOptions;
 use super::domain::Domain;
 use super::tracker::Tracker;
 use crate::error::Result;
-use crate::grid::{Face, LeafId, LeafMask, LeafSet, LeafValues, PageLeaves, Paged, neighbour_index};
+use crate::grid::{Face, LEAF_VOXELS, LeafId, LeafMask, LeafSet, LeafValues, PageLeaves, Paged, neighbour_index};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 use crate::stencil::simd::{Lanes, Work, dispatch};
@@ -58,8 +58,10 @@ impl Tracker<'_> {
             let grid = &*self.grid;
             buffer.par_update(&touched, |id, values| {
                 let (phi, active) = (grid.values(id), grid.mask(id));
-                for (offset, v) in values.0.iter_mut().enumerate() {
-                    *v = if active.get(offset) { *v } else { phi.0[offset] };
+                // Rows with an active voxel are written whole by the next step.
+                let empty = |at: usize| active.0[at / 64] >> (at % 64) & 0xffff == 0;
+                for at in (0..LEAF_VOXELS).step_by(16).filter(|at| empty(*at)) {
+                    values.0[at..at + 16].copy_from_slice(&phi.0[at..at + 16]);
                 }
             });
         }

@@ -7,7 +7,7 @@ use fearless_simd::{Simd, SimdBase};
 use glam::IVec3;
 
 use super::simd::Lanes;
-use crate::grid::{LeafValues, Neighbours, Paged};
+use crate::grid::{LEAF_VOXELS, LeafValues, Neighbours, Paged};
 
 /// Eight voxels along z.
 pub type Row = [f32; 8];
@@ -35,14 +35,12 @@ impl Halo {
                 9 => (2, 0),
                 _ => (1, x - 1),
             };
-            for (j, rows, first, count) in [(0, 7, 0, 1), (1, 0, 1, 8), (2, 0, 9, 1)] {
-                let leaf = |k: usize| &values.get(around[i * 9 + j * 3 + k]).0[from * 64 + rows * 8..][..count * 8];
-                let (below, centre, above) = (leaf(0), leaf(1), leaf(2));
-                let to = first * 8..(first + count) * 8;
-                self.slabs[1][x][to.clone()].copy_from_slice(centre);
-                shift_up(&mut self.slabs[0][x][to.clone()], centre, below, 1);
-                shift_down(&mut self.slabs[2][x][to], centre, above, 1);
-            }
+            let leaf = |q: usize| slab(&values.get(around[i * 9 + q]).0, from);
+            let [low, middle, high] = &mut self.slabs;
+            let slabs = &mut [&mut low[x], &mut middle[x], &mut high[x]];
+            fill::<8>(slabs, 0, [&leaf(0)[56..], &leaf(1)[56..], &leaf(2)[56..]]);
+            fill::<64>(slabs, 8, [leaf(3), leaf(4), leaf(5)]);
+            fill::<8>(slabs, 72, [&leaf(6)[..8], &leaf(7)[..8], &leaf(8)[..8]]);
         }
     }
 
@@ -103,15 +101,18 @@ impl StarHalo {
             self.slabs[11 + x][24..88].copy_from_slice(&leaf(22)[x * 64..][..64]);
         }
         for x in 0..8 {
-            let slab = &mut self.slabs[3 + x];
-            slab[..24].copy_from_slice(&leaf(10)[x * 64 + 40..][..24]);
-            slab[24..88].copy_from_slice(&centre[x * 64..][..64]);
-            slab[88..].copy_from_slice(&leaf(16)[x * 64..][..24]);
-            let [own, below, above] = [13, 12, 14].map(|q| &leaf(q)[x * 64..][..64]);
-            for by in 1..=3 {
-                shift_up(&mut self.shifted[3 - by][x], own, below, by);
-                shift_down(&mut self.shifted[2 + by][x], own, above, by);
-            }
+            let rows = &mut self.slabs[3 + x];
+            rows[..24].copy_from_slice(&leaf(10)[x * 64 + 40..][..24]);
+            rows[24..88].copy_from_slice(&centre[x * 64..][..64]);
+            rows[88..].copy_from_slice(&leaf(16)[x * 64..][..24]);
+            let (own, below, above) = (slab(leaf(13), x), slab(leaf(12), x), slab(leaf(14), x));
+            let [m3, m2, m1, p1, p2, p3] = &mut self.shifted;
+            shift_up::<64, 3>(&mut m3[x], own, below);
+            shift_up::<64, 2>(&mut m2[x], own, below);
+            shift_up::<64, 1>(&mut m1[x], own, below);
+            shift_down::<64, 1>(&mut p1[x], own, above);
+            shift_down::<64, 2>(&mut p2[x], own, above);
+            shift_down::<64, 3>(&mut p3[x], own, above);
         }
     }
 
@@ -144,24 +145,55 @@ impl Default for StarHalo {
     }
 }
 
-/// Rows of 8 moved up in z: `to[z] = own[z − by]`, what enters below coming from the end of `below`'s rows.
+/// The 64 values of slab x of a leaf.
 #[inline(always)]
-fn shift_up(to: &mut [f32], own: &[f32], below: &[f32], by: usize) {
-    let n = own.len();
-    // One copy for all rows; the first voxels of each are then put right.
-    to[by..n].copy_from_slice(&own[..n - by]);
-    for row in (0..n).step_by(8) {
-        to[row..row + by].copy_from_slice(&below[row + 8 - by..row + 8]);
+fn slab(leaf: &[f32; LEAF_VOXELS], x: usize) -> &[f32; 64] {
+    &leaf.as_chunks().0[x]
+}
+
+/// Puts N / 8 rows of a leaf into the three slabs (shifted by −1, 0, 1 in z) from position `at` on; `leaves` are the one
+/// below, the leaf itself and the one above.
+#[inline(always)]
+fn fill<const N: usize>(slabs: &mut [&mut [f32; 80]; 3], at: usize, leaves: [&[f32]; 3]) {
+    let [low, middle, high] = slabs;
+    let targets = (low[at..].first_chunk_mut(), middle[at..].first_chunk_mut(), high[at..].first_chunk_mut());
+    let sources = (leaves[0].first_chunk::<N>(), leaves[1].first_chunk::<N>(), leaves[2].first_chunk::<N>());
+    if let (Some(low), Some(middle), Some(high)) = targets
+        && let (Some(below), Some(own), Some(above)) = sources
+    {
+        *middle = *own;
+        shift_up::<N, 1>(low, own, below);
+        shift_down::<N, 1>(high, own, above);
     }
 }
 
-/// Rows of 8 moved down in z: `to[z] = own[z + by]`.
+/// Rows of 8 moved up in z: `to[z] = own[z − BY]`, what enters below coming from the end of `below`'s rows.
 #[inline(always)]
-fn shift_down(to: &mut [f32], own: &[f32], above: &[f32], by: usize) {
-    let n = own.len();
-    to[..n - by].copy_from_slice(&own[by..]);
-    for row in (0..n).step_by(8) {
-        to[row + 8 - by..row + 8].copy_from_slice(&above[row..row + by]);
+fn shift_up<const N: usize, const BY: usize>(to: &mut [f32; N], own: &[f32; N], below: &[f32; N]) {
+    // Vector by vector across the rows; the first voxels of each row are then put right. Lengths are constants throughout:
+    // a copy of a length known at run time would be a call.
+    let mut k = 0;
+    while k + 16 + BY <= N {
+        to[k + BY..k + BY + 16].copy_from_slice(&own[k..k + 16]);
+        k += 16;
+    }
+    to[k + BY..].copy_from_slice(&own[k..N - BY]);
+    for row in (0..N).step_by(8) {
+        to[row..row + BY].copy_from_slice(&below[row + 8 - BY..row + 8]);
+    }
+}
+
+/// Rows of 8 moved down in z: `to[z] = own[z + BY]`.
+#[inline(always)]
+fn shift_down<const N: usize, const BY: usize>(to: &mut [f32; N], own: &[f32; N], above: &[f32; N]) {
+    let mut k = 0;
+    while k + 16 + BY <= N {
+        to[k..k + 16].copy_from_slice(&own[k + BY..k + BY + 16]);
+        k += 16;
+    }
+    to[k..N - BY].copy_from_slice(&own[k + BY..]);
+    for row in (0..N).step_by(8) {
+        to[row + 8 - BY..row + 8].copy_from_slice(&above[row..row + BY]);
     }
 }
 
