@@ -89,7 +89,7 @@ fn fewer_triangles_by_ratio_or_by_distance() {
     let desk = Desk::new();
     let full = desk.done(&["convert", "ball.vdb", "-o", "full.ply"])["triangles"].as_f64().unwrap();
     let part = desk.done(&["convert", "ball.vdb", "-o", "part.ply", "--simplify", "0.25"]);
-    assert_eq!((&part["triangles_before"], warnings(&part)), (&full.into(), String::new()));
+    assert_eq!((part["triangles_before"].as_f64(), warnings(&part)), (Some(full), String::new()));
     assert!((part["triangles"].as_f64().unwrap() / full - 0.25).abs() < 0.01, "{part}");
     let topology = analyze(&desk.mesh("part.ply"));
     assert!(topology.closed && topology.euler_characteristic == 2, "{topology:?}");

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use smallvec::SmallVec;
 
 use super::LevelSet;
-use super::isosurface::{IsoSurface, MEMORY_ADVICE, corner};
+use super::isosurface::{IsoSurface, MEMORY_ADVICE};
 use super::union_find::UnionFind;
 use crate::error::Result;
 use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, leaf_offset, leaf_origin, neighbour_index};
@@ -82,20 +82,24 @@ impl Components {
         self.labels.get(number as usize).copied()
     }
 
-    /// The component of the inside voxel that is nearest to an index-space position among the corners of its cell, as for
-    /// points of the surface; `None` if all are outside or the position is far away.
+    /// The component of an index-space position near the surface: that of the nearest inside voxel among the corners of its
+    /// cell, or of the cells around where all are outside (as beside a voxel on the surface); `None` far outside.
     pub fn nearest(&self, ijk: DVec3) -> Option<u32> {
-        let limit = f64::from(crate::grid::MAX_COORD - 2);
+        let limit = f64::from(crate::grid::MAX_COORD - 4);
         if ijk.is_nan() || ijk.abs().max_element() >= limit {
             return None;
         }
         let first = ijk.floor().as_ivec3();
-        let mut corners: [IVec3; 8] = std::array::from_fn(|c| first + corner(c));
-        corners.sort_by(|a, b| {
-            let [a, b] = [a, b].map(|c| c.as_dvec3().distance_squared(ijk));
-            a.total_cmp(&b)
-        });
-        corners.into_iter().find_map(|c| self.at(c))
+        let nearest_of = |lo: i32, hi: i32| {
+            let voxels =
+                (lo..=hi).flat_map(|x| (lo..=hi).flat_map(move |y| (lo..=hi).map(move |z| IVec3::new(x, y, z))));
+            let inside = voxels.filter_map(|step| {
+                let voxel = first + step;
+                self.at(voxel).map(|label| (voxel.as_dvec3().distance_squared(ijk), label))
+            });
+            inside.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, label)| label)
+        };
+        nearest_of(0, 1).or_else(|| nearest_of(-1, 2))
     }
 }
 
