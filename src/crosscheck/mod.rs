@@ -70,13 +70,16 @@ enum Judge {
     Truth { offset: f64 },
 }
 
+/// Changes a grid in place: the timed part.
+type Operation<Grid> = Box<dyn Fn(&mut Grid) -> Result<()>>;
+
 struct Case {
     operator: &'static str,
     scheme: &'static str,
     tolerance: f64,
     judge: Judge,
-    ours: Box<dyn Fn(&mut LevelSet) -> Result<()>>,
-    theirs: Box<dyn Fn(&mut ReferenceGrid) -> Result<()>>,
+    ours: Operation<LevelSet>,
+    theirs: Operation<ReferenceGrid>,
 }
 
 /// Fewest and most runs of a case, and the time after which no new one begins.
@@ -281,8 +284,8 @@ fn measure(case: &Case, level_set: &LevelSet, truth: &LazyCell<Bvh, impl FnOnce(
             Judge::SignedAlike => difference.between(&ours, &theirs, true),
             Judge::Truth { offset } => {
                 let mut other = Difference::default();
-                difference.to_truth(&ours, truth, level_set, offset);
-                other.to_truth(&theirs, truth, level_set, offset);
+                difference.against_truth(&ours, truth, level_set, offset);
+                other.against_truth(&theirs, truth, level_set, offset);
                 openvdb_max_error_voxels = Some(other.max);
             }
         }
@@ -357,7 +360,7 @@ impl Difference {
     }
 
     /// Against the distance to triangles, signed by `source`.
-    fn to_truth(&mut self, result: &LevelSet, bvh: &Bvh, source: &LevelSet, offset: f64) {
+    fn against_truth(&mut self, result: &LevelSet, bvh: &Bvh, source: &LevelSet, offset: f64) {
         let mut field = source.grid().accessor();
         let reach = f64::from(result.half_width()) + offset.abs() + 2.0;
         let mut count = 0u32;
