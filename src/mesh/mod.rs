@@ -1,6 +1,7 @@
 //! Triangle meshes: files, and the way to a level set and back.
 
 mod attributes;
+mod bezier;
 mod bvh;
 mod closest;
 pub mod files;
@@ -10,6 +11,7 @@ mod prepare;
 mod quads;
 mod rebuild;
 mod scatter;
+mod shell;
 mod simplify;
 #[cfg(test)]
 mod testing;
@@ -19,6 +21,7 @@ mod unit;
 mod winding;
 
 pub use attributes::{Attributes, transfer_attributes};
+pub use bezier::BezierPatches;
 pub use bvh::{Bvh, Hit};
 pub use files::{MeshFormat, ReadMesh, read, write, write_quads, write_to};
 pub use findings::MeshFindings;
@@ -27,6 +30,7 @@ pub use prepare::prepare;
 pub use quads::{QuadMesh, level_set_to_quads};
 pub use rebuild::{Rebuild, onto_lattice, rebuild, with_half_width};
 pub use scatter::{UnsignedLeaf, distance_to_triangles};
+pub use shell::shell;
 pub use simplify::{Bound, Simplified, simplify};
 pub use to_levelset::{MeshToLevelSet, mesh_to_level_set};
 pub use topology::{Topology, analyze};

@@ -3,23 +3,28 @@
 //! Spheres, boxes, tori, cylinders and capsules are sampled from their closed-form distance. A superellipsoid or supertoroid
 //! is sampled as an implicit function and its distance rebuilt from the zero set (Barr 1981).
 
+use std::path::Path;
+
+use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::params::{WorldLength, voxel_size};
-use super::registry::{Arity, Operator, Outcome};
+use super::registry::{Arity, Operator, Outcome, Summary};
 use crate::error::{EditError, Result};
 use crate::grid::{MAX_COORD, Transform};
 use crate::levelset::shapes::Solid;
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
-use crate::mesh::{MeshToLevelSet, Rebuild, rebuild};
+use crate::mesh::{BezierPatches, MeshToLevelSet, Rebuild, mesh_to_level_set, rebuild, shell};
 use crate::run::RunOptions;
+use crate::spec::Spec;
 
 /// Make a level set of an analytic solid.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Shape {
-    /// The solid, such as `torus major=1 minor=0.3 axis=z` (world units).
+    /// The solid, such as `torus major=1 minor=0.3 axis=z` (world units). Kinds: `sphere`, `box`, `torus`, `cylinder`, `capsule`,
+    /// `superellipsoid`, `supertoroid`, and `bezier file=F [thickness=t]` for the patches of a BPT file.
     pub spec: String,
     /// Edge of a voxel in world units.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -40,12 +45,44 @@ impl Default for Shape {
 /// Voxels along the longest edge where nothing is asked for.
 const DEFAULT_RESOLUTION: u32 = 256;
 
+/// What is made: a solid with a formula, or the surface of a file of patches.
+enum Source {
+    Solid(Solid),
+    Patches { patches: BezierPatches, thickness: Option<f64> },
+}
+
+impl Source {
+    fn parse(text: &str) -> Result<Self> {
+        let spec = Spec::parse("shape", text)?;
+        if spec.kind() != "bezier" {
+            return Solid::parse(text).map(Self::Solid);
+        }
+        let file = spec.text("file").ok_or_else(|| spec.refuse("`bezier` needs `file=` (a BPT file of patches)"))?;
+        let thickness = spec.number("thickness")?;
+        spec.finish()?;
+        if thickness.is_some_and(|t| t <= 0.0) {
+            return Err(spec.refuse("`thickness` positive, or none for the inside of a closed surface"));
+        }
+        Ok(Self::Patches { patches: BezierPatches::read(Path::new(file))?, thickness })
+    }
+
+    fn bounds(&self) -> (DVec3, DVec3) {
+        match self {
+            Self::Solid(solid) => solid.bounds(),
+            Self::Patches { patches, thickness } => {
+                let ((lo, hi), margin) = (patches.bounds(), thickness.unwrap_or(0.0) / 2.0);
+                (lo - margin, hi + margin)
+            }
+        }
+    }
+}
+
 impl Shape {
-    fn resolved_voxel_size(&self, solid: &Solid) -> Result<f64> {
+    fn resolved_voxel_size(&self, source: &Source) -> Result<f64> {
         if let Some(size) = self.voxel_size {
             return voxel_size(Self::NAME, size);
         }
-        let (lo, hi) = solid.bounds();
+        let (lo, hi) = source.bounds();
         Ok((hi - lo).max_element() / f64::from(self.resolution.unwrap_or(DEFAULT_RESOLUTION)))
     }
 }
@@ -55,7 +92,7 @@ impl Operator for Shape {
     const ARITY: Arity = Arity::Source;
 
     fn validate(&self) -> Result<()> {
-        let solid = Solid::parse(&self.spec)?;
+        let source = Source::parse(&self.spec)?;
         if let (Some(size), Some(_)) = (self.voxel_size, self.resolution) {
             return Err(EditError::parameter(
                 Self::NAME,
@@ -67,9 +104,9 @@ impl Operator for Shape {
         if self.resolution == Some(0) {
             return Err(EditError::parameter(Self::NAME, "resolution", 0, "1 voxel or more"));
         }
-        let size = self.resolved_voxel_size(&solid)?;
+        let size = self.resolved_voxel_size(&source)?;
         MeshToLevelSet { half_width: self.half_width, ..MeshToLevelSet::new(size) }.validate()?;
-        let (lo, hi) = solid.bounds();
+        let (lo, hi) = source.bounds();
         let farthest = lo.abs().max(hi.abs()).max_element() / size + f64::from(self.half_width) + 2.0;
         if farthest > f64::from(MAX_COORD) {
             return Err(EditError::parameter(
@@ -84,8 +121,12 @@ impl Operator for Shape {
 
     fn apply(&self, _: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
         self.validate()?;
-        let solid = Solid::parse(&self.spec)?;
-        let size = self.resolved_voxel_size(&solid)?;
+        let source = Source::parse(&self.spec)?;
+        let size = self.resolved_voxel_size(&source)?;
+        let solid = match source {
+            Source::Solid(solid) => solid,
+            Source::Patches { patches, thickness } => return self.of_patches(&patches, thickness, size, run),
+        };
         let (lo, hi) = solid.bounds();
         let margin = f64::from(self.half_width) + 2.0;
         let bounds = ((lo / size - margin).floor().as_ivec3(), (hi / size + margin).ceil().as_ivec3());
@@ -106,6 +147,39 @@ impl Operator for Shape {
         Ok(rebuild(&rough, &Rebuild::band(self.half_width), run)?.into())
     }
 }
+
+impl Shape {
+    /// The inside of a surface of patches, or the shell around it.
+    fn of_patches(
+        &self,
+        patches: &BezierPatches,
+        thickness: Option<f64>,
+        size: f64,
+        run: &RunOptions,
+    ) -> Result<Outcome> {
+        // Edges of a voxel: the triangles lie within an eighth of κ·h² of the surface.
+        let mesh = patches.tessellate(size);
+        let params = MeshToLevelSet { half_width: self.half_width, ..MeshToLevelSet::new(size) };
+        if let Some(thickness) = thickness {
+            let level_set = shell(&mesh, thickness, &params, run)?;
+            let mut summary = Summary::default();
+            if thickness < THINNEST_SHELL * size {
+                summary.warnings.push(format!(
+                    "a shell of {:.1} voxels may have holes: take a voxel size of {:e} or less",
+                    thickness / size,
+                    thickness / THINNEST_SHELL
+                ));
+            }
+            return Ok(Outcome { level_set, summary });
+        }
+        let (level_set, findings) = mesh_to_level_set(&mesh, &params, run)?;
+        Ok(Outcome { level_set, summary: Summary { warnings: findings.warnings(), ..Summary::default() } })
+    }
+}
+
+/// Voxels of thickness from which on a sheet in any position has whole voxels inside everywhere: the diagonal of a cell (√3),
+/// and room for the slope of the field on either side.
+const THINNEST_SHELL: f64 = 3.0;
 
 /// Band of an implicit function whose slope at the surface is between a third and three.
 const SAMPLED_BAND: f32 = 8.0;
@@ -137,6 +211,24 @@ mod tests {
             assert!((measured.volume / volume - 1.0).abs() < 2e-3, "{spec}: {} {volume}", measured.volume);
             assert_eq!((measured.components, measured.euler), (1, if spec.contains("tor") { 0 } else { 2 }), "{spec}");
         }
+    }
+
+    #[test]
+    fn patches_become_shells_and_solids() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("one patch.bpt");
+        std::fs::write(&file, "1\n1 1\n0 0 0\n0 2 0\n3 0 0\n3 2 0\n").unwrap();
+        let plate = make(&format!("bezier file=\"{}\" thickness=0.4", file.display()), 0.05);
+        assert!(plate.check().is_empty(), "{:?}", plate.check());
+        // A rectangle of 2 x 3 with a rounded border: area times thickness, half a cylinder along the border, a ball at the corners.
+        let r = 0.2f64;
+        let volume = 6.0 * 0.4 + std::f64::consts::PI * r * r * 5.0 + 4.0 / 3.0 * std::f64::consts::PI * r.powi(3);
+        let measured = plate.measure(&RunOptions::default()).unwrap();
+        assert!((measured.volume / volume - 1.0).abs() < 5e-3, "{} {volume}", measured.volume);
+        let open = Shape { spec: format!("bezier file=\"{}\"", file.display()), ..Shape::default() };
+        assert!(open.apply(Vec::new(), &RunOptions::default()).is_err(), "a sheet encloses nothing");
+        let missing = Shape { spec: "bezier file=nowhere.bpt".into(), ..Shape::default() };
+        assert_eq!(missing.validate().unwrap_err().exit_code(), 3);
     }
 
     #[test]
