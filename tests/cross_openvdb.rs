@@ -13,6 +13,9 @@ use vdb_edit::pde::{SolverOptions, UpwindScheme, WenoEpsilon, renormalize, track
 use vdb_edit::run::RunOptions;
 use vdb_edit::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceMesh, ReferenceScheme, Tracker};
 
+/// The name of a subject and its distance function, in voxels.
+type Exact = (&'static str, fn(DVec3) -> f64);
+
 /// A sphere, a torus and two scanned models, none of them centred on a voxel.
 fn subjects() -> Vec<(&'static str, LevelSet)> {
     let run = RunOptions::default();
@@ -194,7 +197,7 @@ fn error_to(truth: impl Fn(DVec3) -> f64, reach: f64, level_set: &LevelSet) -> f
 /// shows that both move the same way by the same length.
 #[test]
 fn offsets_by_one_voxel_against_the_truth() {
-    let exact: [(&str, fn(DVec3) -> f64); 2] = [("sphere", sphere_distance), ("torus", torus_distance)];
+    let exact: [Exact; 2] = [("sphere", sphere_distance), ("torus", torus_distance)];
     for ((name, truth), (_, level_set)) in exact.into_iter().zip(subjects()) {
         for sign in [1.0, -1.0] {
             let moved = |p: DVec3| truth(p) - sign;
@@ -212,7 +215,7 @@ fn offsets_by_one_voxel_against_the_truth() {
 /// The band anew from the zero set: both against the truth, 0.05 voxel (the tolerance of `crosscheck`).
 #[test]
 fn rebuild_against_the_truth() {
-    let exact: [(&str, fn(DVec3) -> f64); 2] = [("sphere", sphere_distance), ("torus", torus_distance)];
+    let exact: [Exact; 2] = [("sphere", sphere_distance), ("torus", torus_distance)];
     for ((name, truth), (_, level_set)) in exact.into_iter().zip(subjects()) {
         let ours = rebuild(&level_set, &Rebuild::band(3.0), &RunOptions::default()).unwrap();
         let theirs = ReferenceGrid::from_level_set(&level_set).unwrap().rebuild(0.0, 3.0).unwrap();

@@ -139,7 +139,7 @@ pub fn write_to(out: &mut dyn Write, format: MeshFormat, mesh: &TriangleMesh) ->
     }
 }
 
-/// Writes a mesh of quads, like [`write`]: as quads where the format [has polygons](MeshFormat::has_polygons), else in
+/// Writes a mesh of quads, like [`write()`]: as quads where the format [has polygons](MeshFormat::has_polygons), else in
 /// triangles.
 pub fn write_quads(path: &Path, mesh: &QuadMesh) -> Result<()> {
     let polygons = Polygons::from(mesh);

@@ -81,6 +81,7 @@ pub fn mesh_to_level_set(
     run: &RunOptions,
 ) -> Result<(LevelSet, MeshFindings)> {
     check_numbers(mesh)?;
+    check_room(mesh)?;
     params.validate()?;
     check_range(mesh, params)?;
     let (mut clean, mut findings) = prepare(mesh);
@@ -198,6 +199,11 @@ pub(super) fn check_numbers(mesh: &TriangleMesh) -> Result<()> {
             format!("vertex {v} (of triangle {t}) is at {}: coordinates must be finite", mesh.positions[v as usize]);
         return Err(EditError::input("mesh", problem));
     }
+    Ok(())
+}
+
+/// Refuses coordinates that no voxel size has room for.
+fn check_room(mesh: &TriangleMesh) -> Result<()> {
     let farthest = mesh.bounding_box().map_or(0.0, |(lo, hi)| lo.abs().max(hi.abs()).max_element());
     let room = f64::from(MAX_COORD) * VOXEL_SIZES.end();
     if farthest > room {

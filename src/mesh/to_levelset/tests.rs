@@ -138,8 +138,9 @@ fn what_encloses_nothing_is_refused_with_a_reason() {
         assert!(error.exit_code() == 3 && error.to_string().contains(word), "{error}");
     }
     let far = cube(DVec3::splat(1e30), 1e30);
-    for (mesh, voxel_size) in [(&far, 1.0), (&quad, 0.0), (&quad, f64::NAN), (&quad, -1.0), (&quad, 50.0)] {
-        let error = convert(mesh, voxel_size).err().unwrap();
+    assert_eq!(convert(&far, 1.0).err().unwrap().exit_code(), 3, "no voxel size has room for it");
+    for voxel_size in [0.0, f64::NAN, -1.0, 50.0] {
+        let error = convert(&quad, voxel_size).err().unwrap();
         assert_eq!(error.exit_code(), 2, "{error}");
     }
     let mut run = RunOptions::default();
@@ -209,7 +210,7 @@ fn nasty_meshes_become_valid_level_sets_or_clear_errors() {
     }
     assert!(surprises.is_empty(), "{surprises:#?}");
     let huge = shared_mesh("nasty/huge_coordinates.obj").unwrap();
-    assert_eq!(convert(&huge, 1.0).err().unwrap().exit_code(), 2);
+    assert_eq!(convert(&huge, 1.0).err().unwrap().exit_code(), 3);
 }
 
 #[test]
