@@ -8,6 +8,7 @@
 //! come from the second alone, are written.
 
 use glam::IVec3;
+use rustc_hash::FxHashMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -15,7 +16,7 @@ use super::params::words;
 use super::registry::{Arity, Operator, Outcome, Summary};
 use crate::error::Result;
 use crate::grid::{Grid, LEAF_VOXELS, LeafId, LeafMask, LeafSet, LeafValues};
-use crate::levelset::LevelSet;
+use crate::levelset::{LevelSet, background};
 use crate::mesh::{Rebuild, onto_lattice, rebuild, with_half_width};
 use crate::run::RunOptions;
 
@@ -96,7 +97,7 @@ pub fn align(mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<(Vec<LevelSe
             }
             *input = onto_lattice(input, &transform, half_width, run)?;
         }
-        if input.background() != inputs_background(&transform, half_width) {
+        if input.background() != background(half_width, &transform) {
             if (input.half_width() - half_width).abs() >= 1e-3 {
                 warnings.push(format!(
                     "input {}: its band of {} voxels was made {half_width} wide",
@@ -108,10 +109,6 @@ pub fn align(mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<(Vec<LevelSe
         }
     }
     Ok((inputs, warnings))
-}
-
-fn inputs_background(transform: &crate::grid::Transform, half_width: f32) -> f32 {
-    crate::levelset::background(half_width, transform)
 }
 
 /// One operation on two level sets of the same lattice and half width.
@@ -142,25 +139,26 @@ fn combine(a: &Grid, b: &Grid, operation: CsgOperation) -> Grid {
     out.remove_leaves(&swallowed, union);
 
     let mut both = LeafSet::default();
-    let mut copied: Vec<IVec3> = Vec::new();
+    // The leaves that come from the second operand alone: where they go, and which they are.
+    let (mut places, mut sources): (Vec<IVec3>, Vec<LeafId>) = Default::default();
     for &id in b.leaves() {
         let here = a.find(b.origin(id));
         if !here.is_sentinel() {
             both.insert(here);
         } else if !wins(here == LeafId::INSIDE) {
-            copied.push(b.origin(id));
+            places.push(b.origin(id));
+            sources.push(id);
         }
     }
-    let added: LeafSet = out.add_leaves(&copied).into_iter().collect();
+    let copied: FxHashMap<LeafId, LeafId> = out.add_leaves(&places).into_iter().zip(sources).collect();
+    let added: LeafSet = copied.keys().copied().collect();
     let sign = if negate { -1.0 } else { 1.0 };
-    let origins = a.clone();
     out.update(&both, |id, values, mask| {
-        let other = b.find(origins.origin(id));
+        let other = b.find(a.origin(id));
         merge_leaf(values, mask, b.values(other), b.mask(other), sign, union);
     });
-    let places = out.clone();
     out.update(&added, |id, values, mask| {
-        let source = b.find(places.origin(id));
+        let source = copied[&id];
         *mask = b.mask(source);
         for (v, s) in values.0.iter_mut().zip(&b.values(source).0) {
             *v = sign * s;
