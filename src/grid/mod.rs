@@ -56,6 +56,12 @@ impl Grid {
         Self { background, topology: Arc::new(topology), values, masks }
     }
 
+    /// A grid of the same leaves and active voxels whose values are all 0, the background as well: for fields that are no distance.
+    pub(crate) fn zeroed(&self) -> Self {
+        let values = Paged::filled(self.values.page_count(), LeafValues::default());
+        Self { background: 0.0, values, ..self.clone() }
+    }
+
     /// The value that stands for everything outside; its negative for everything inside.
     pub fn background(&self) -> f32 {
         self.background

@@ -6,7 +6,9 @@
 mod build;
 mod check;
 mod components;
+mod curvature;
 pub(crate) mod dual;
+mod field;
 pub(crate) mod isosurface;
 mod lattice;
 pub(crate) mod marching;
@@ -22,8 +24,10 @@ use glam::{DVec3, IVec3};
 
 pub(crate) use build::grid_of_leaves;
 pub use components::Components;
+pub use curvature::{CurvatureKind, curvature};
+pub use field::Field;
 pub use measure::Measures;
-pub use sample::Sampler;
+pub use sample::{Interpolation, Sampler};
 pub use violation::{Violation, ViolationKind};
 
 use crate::grid::{Grid, Transform};

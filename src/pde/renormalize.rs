@@ -79,7 +79,7 @@ impl LeafKernel for FirstOrder {
             |x, y, _| {
                 let at = x * 64 + y * 8;
                 let phi = halo.rows(simd, x, y, [0; 3]);
-                self.0.euler(simd, phi, godunov_first(simd, halo, x, y)).store_slice(&mut out.0[at..at + 16]);
+                self.0.euler(simd, phi, godunov_first(simd, halo, x, y, phi)).store_slice(&mut out.0[at..at + 16]);
             },
         );
     }
@@ -111,7 +111,7 @@ impl LeafKernel for Weno5 {
                 let at = x * 64 + y * 8;
                 let phi = halo.centre(simd, x, y);
                 self.0
-                    .euler(simd, phi, godunov_weno5(simd, halo, x, y, self.0.voxel_size, self.1))
+                    .euler(simd, phi, godunov_weno5(simd, halo, x, y, phi, self.0.voxel_size, self.1))
                     .store_slice(&mut out.0[at..at + 16]);
             },
         );

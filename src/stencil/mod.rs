@@ -6,6 +6,7 @@
 
 pub mod curvature;
 mod halo;
+pub mod normals;
 pub mod simd;
 pub mod upwind;
 

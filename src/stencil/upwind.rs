@@ -1,9 +1,11 @@
 //! Upwind |∇φ|² of a row: Godunov's choice among one-sided differences, first order or HJ-WENO5.
 //!
-//! For φ_t + S(|∇φ| − 1) = 0 with S of φ's sign, information flows away from the surface:
+//! For φ_t + F|∇φ| = … information comes from where φ is smaller if F > 0, and from where it is larger if F < 0:
 //!
-//! > φ > 0:  |Dφ|² = Σ max( max(D⁻, 0)², min(D⁺, 0)² )
-//! > φ ≤ 0:  |Dφ|² = Σ max( min(D⁻, 0)², max(D⁺, 0)² )
+//! > F > 0:  |Dφ|² = Σ max( max(D⁻, 0)², min(D⁺, 0)² )
+//! > F ≤ 0:  |Dφ|² = Σ max( min(D⁻, 0)², max(D⁺, 0)² )
+//!
+//! Renormalisation, φ_τ + S(|∇φ| − 1) = 0 with S of φ's sign, takes φ itself for F: information flows away from the surface.
 //!
 //! HJ-WENO5 weighs three third-order one-sided differences by their smoothness (Jiang & Peng 2000; Shu's ICASE report
 //! 97-65); fifth order where φ is smooth, and never worse than third order beside a kink.
@@ -23,9 +25,9 @@ pub enum UpwindScheme {
     HjWeno5,
 }
 
-/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by first-order differences.
+/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by first-order differences, upwind for a speed of `direction`'s sign.
 #[inline(always)]
-pub fn godunov_first<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize) -> Lanes<S> {
+pub fn godunov_first<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, direction: Lanes<S>) -> Lanes<S> {
     let centre = halo.rows(simd, x, y, [0; 3]);
     let mut sum = Lanes::splat(simd, 0.0);
     for axis in 0..3 {
@@ -33,18 +35,19 @@ pub fn godunov_first<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize) -> Lanes
         step[axis] = 1;
         let after = halo.rows(simd, x, y, step);
         let before = halo.rows(simd, x, y, step.map(isize::wrapping_neg));
-        sum += godunov(simd, centre, centre - before, after - centre);
+        sum += godunov(simd, direction, centre - before, after - centre);
     }
     sum
 }
 
-/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by HJ-WENO5 differences.
+/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by HJ-WENO5 differences, upwind for a speed of `direction`'s sign.
 #[inline(always)]
 pub fn godunov_weno5<S: Simd>(
     simd: S,
     halo: &StarHalo,
     x: usize,
     y: usize,
+    direction: Lanes<S>,
     voxel_size: f32,
     epsilon: WenoEpsilon,
 ) -> Lanes<S> {
@@ -57,19 +60,19 @@ pub fn godunov_weno5<S: Simd>(
         let (v4, v5, v6) = (p1 - centre, p2 - p1, p3 - p2);
         let before = weno5(simd, [v1, v2, v3, v4, v5], scale, epsilon);
         let after = weno5(simd, [v6, v5, v4, v3, v2], scale, epsilon);
-        sum += godunov(simd, centre, before, after);
+        sum += godunov(simd, direction, before, after);
     }
     sum
 }
 
-/// One axis of Godunov's |Dφ|², for a field that grows away from its zero set.
+/// One axis of Godunov's |Dφ|².
 #[inline(always)]
-fn godunov<S: Simd>(simd: S, phi: Lanes<S>, before: Lanes<S>, after: Lanes<S>) -> Lanes<S> {
+fn godunov<S: Simd>(simd: S, direction: Lanes<S>, before: Lanes<S>, after: Lanes<S>) -> Lanes<S> {
     let zero = Lanes::splat(simd, 0.0);
-    // Inside, the mirrored field −φ obeys the outside rule.
-    let outside = phi.simd_gt(zero);
-    let a = outside.select(before, -before).max(zero);
-    let b = outside.select(after, -after).min(zero);
+    // For F ≤ 0 the mirrored field −φ obeys the rule for F > 0.
+    let outwards = direction.simd_gt(zero);
+    let a = outwards.select(before, -before).max(zero);
+    let b = outwards.select(after, -after).min(zero);
     (a * a).max(b * b)
 }
 
