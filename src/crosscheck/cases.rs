@@ -12,7 +12,7 @@ use crate::ops::csg::{CsgOperation, csg};
 use crate::ops::morphology::offset;
 use crate::ops::smooth::{Smooth, SmoothMethod, smooth};
 use crate::ops::{EvolutionOptions, Like, Scheme};
-use crate::pde::{SolverOptions, UpwindScheme, WenoEpsilon, renormalize, track};
+use crate::pde::{MorphOptions, SolverOptions, Until, UpwindScheme, WenoEpsilon, morph_towards, renormalize, track};
 use crate::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceScheme, Tracker};
 
 /// A row of the table.
@@ -47,6 +47,12 @@ pub(super) const CASES: &[Case] = &[
         scheme: "one voxel: exact, against HJ-WENO5, RK1, 3",
         tolerance: 0.05,
         contest: exact_offset,
+    },
+    Case {
+        operator: "morph",
+        scheme: "towards a copy one voxel larger, time 1, HJ-WENO5, RK2; track HJ-WENO5, RK1, 3",
+        tolerance: 1e-3,
+        contest: morph,
     },
     Case {
         operator: "csg-union",
@@ -144,6 +150,19 @@ fn exact_offset<'a>(input: &'a Input<'a>) -> Sides<'a> {
             grid.apply(Filter::Offset(voxel as f32), &Tracker::default())
         }),
     )
+}
+
+fn morph<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let target = offset(input.level_set, input.level_set.voxel_size(), input.run)?;
+    let reference = ReferenceGrid::from_level_set(&target)?;
+    let run = input.run.clone();
+    let ours = move |grid: &mut LevelSet| {
+        morph_towards(grid, &target, None, Until::Time(1.0), &MorphOptions::OPENVDB, &run).map(drop)
+    };
+    let theirs = move |grid: &mut ReferenceGrid| {
+        grid.morph(&reference, 1.0, ReferenceScheme::HjWeno5, 2, &Tracker::default()).map(drop)
+    };
+    GridContest::new(input, Judge::Equal, Operation::in_place(ours), Operation::in_place(theirs))
 }
 
 fn csg_union<'a>(input: &'a Input<'a>) -> Sides<'a> {

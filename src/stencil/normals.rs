@@ -130,7 +130,7 @@ mod tests {
     use crate::stencil::simd::{Isa, Work, choose, dispatch};
 
     /// H, K, κ₁, κ₂ and the central H at the 512 voxels of the leaf at the origin of a field.
-    fn measured(voxel_size: f32, field: &dyn Fn(DVec3) -> f64) -> Vec<[f32; 5]> {
+    fn measured(voxel_size: f32, field: &(dyn Fn(DVec3) -> f64 + Sync)) -> Vec<[f32; 5]> {
         struct Run<'a>(&'a Grid, f32, &'a mut Vec<[f32; 5]>);
         impl Work for Run<'_> {
             fn run<S: Simd>(self, simd: S) {
@@ -166,7 +166,7 @@ mod tests {
     }
 
     /// The scheme in f64, written from its definition with matrices: H, K, κ₁, κ₂.
-    fn reference(h: f64, at: DVec3, field: &dyn Fn(DVec3) -> f64) -> [f64; 4] {
+    fn reference(h: f64, at: DVec3, field: &(dyn Fn(DVec3) -> f64 + Sync)) -> [f64; 4] {
         let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|a| a * h);
         let central = |p: DVec3| DVec3::from_array(axes.map(|a| (field(p + a) - field(p - a)) / (2.0 * h)));
         let staggered = |a: usize, sign: f64| {
@@ -198,7 +198,7 @@ mod tests {
     fn equals_its_definition_in_double_precision() {
         let wavy = |p: DVec3| (p.x * 1.3).sin() + p.y * 0.7 + (p.z * 0.9 + p.x * p.y * 0.2).cos() * 0.5;
         for (voxel_size, field) in
-            [(0.1f32, &wavy as &dyn Fn(DVec3) -> f64), (0.05, &torus), (2e-4, &|p| torus(p * 100.0) / 100.0)]
+            [(0.1f32, &wavy as &(dyn Fn(DVec3) -> f64 + Sync)), (0.05, &torus), (2e-4, &|p| torus(p * 100.0) / 100.0)]
         {
             let h = f64::from(voxel_size);
             for (got, p) in measured(voxel_size, field).iter().zip(positions(h)) {
