@@ -6,7 +6,7 @@ use super::Input;
 use super::contest::{Contest, GridContest, Judge, Operation};
 use crate::error::{EditError, Result};
 use crate::grid::Transform;
-use crate::levelset::LevelSet;
+use crate::levelset::{LevelSet, sweep_distance};
 use crate::mesh::{MeshToLevelSet, Rebuild, mesh_to_level_set, rebuild};
 use crate::ops::csg::{CsgOperation, csg};
 use crate::ops::morphology::offset;
@@ -65,6 +65,18 @@ pub(super) const CASES: &[Case] = &[
         scheme: "half width 3, against levelSetRebuild",
         tolerance: 0.05,
         contest: exact_rebuild,
+    },
+    Case {
+        operator: "sweep",
+        scheme: "distances again in the same band, first order, against sdfToSdf",
+        tolerance: 0.5,
+        contest: sweep,
+    },
+    Case {
+        operator: "sweep-outwards",
+        scheme: "band three voxels wider, first order, against dilateSdf",
+        tolerance: 1.0,
+        contest: sweep_outwards,
     },
     Case {
         operator: "mesh-to-level-set",
@@ -183,6 +195,26 @@ fn exact_rebuild<'a>(input: &'a Input<'a>) -> Sides<'a> {
         Judge::Truth { offset: 0.0 },
         Operation::new(move |grid| rebuild(grid, &Rebuild::band(3.0), &run)),
         Operation::new(|grid: &ReferenceGrid| grid.rebuild(0.0, 3.0)),
+    )
+}
+
+fn sweep<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (half_width, run) = (input.level_set.half_width(), input.run.clone());
+    GridContest::new(
+        input,
+        Judge::Truth { offset: 0.0 },
+        Operation::new(move |grid| sweep_distance(grid, half_width, &run)),
+        Operation::new(|grid: &ReferenceGrid| grid.sweep(1)),
+    )
+}
+
+fn sweep_outwards<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (half_width, run) = (input.level_set.half_width() + 3.0, input.run.clone());
+    GridContest::new(
+        input,
+        Judge::Truth { offset: 0.0 },
+        Operation::new(move |grid| sweep_distance(grid, half_width, &run)),
+        Operation::new(|grid: &ReferenceGrid| grid.sweep_outwards(3, 1)),
     )
 }
 

@@ -48,18 +48,26 @@ impl Grid {
     /// A grid with leaves at `origins` (sorted by x, y, z; multiples of 8; no duplicates), every voxel inactive and outside.
     pub fn from_origins(background: f32, origins: &[IVec3]) -> Self {
         debug_assert!(background > 0.0);
-        let topology = Topology::from_origins(origins);
+        Self::blank_of(Arc::new(Topology::from_origins(origins)), background)
+    }
+
+    /// A grid of the same leaves with another background: no voxel active, every leaf outside.
+    pub(crate) fn blank(&self, background: f32) -> Self {
+        Self::blank_of(self.topology.clone(), background)
+    }
+
+    fn blank_of(topology: Arc<Topology>, background: f32) -> Self {
         let mut values = Paged::filled(1, LeafValues::filled(background));
         *values.get_mut(LeafId::INSIDE) = LeafValues::filled(-background);
         values.grow(topology.page_count(), LeafValues::filled(background));
         let masks = Paged::filled(topology.page_count(), LeafMask::EMPTY);
-        Self { background, topology: Arc::new(topology), values, masks }
+        Self { background, topology, values, masks }
     }
 
     /// A grid of the same leaves and active voxels whose values are all 0, the background as well: for fields that are no distance.
     pub(crate) fn zeroed(&self) -> Self {
-        let values = Paged::filled(self.values.page_count(), LeafValues::default());
-        Self { background: 0.0, values, ..self.clone() }
+        let values = Paged::filled(self.topology.page_count(), LeafValues::default());
+        Self { background: 0.0, topology: self.topology.clone(), values, masks: self.masks.clone() }
     }
 
     /// The value that stands for everything outside; its negative for everything inside.

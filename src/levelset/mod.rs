@@ -15,6 +15,7 @@ pub(crate) mod marching;
 mod measure;
 pub(crate) mod sample;
 pub mod shapes;
+mod sweep;
 #[cfg(test)]
 pub(crate) mod testing;
 mod union_find;
@@ -28,6 +29,7 @@ pub use curvature::{CurvatureKind, curvature};
 pub use field::Field;
 pub use measure::Measures;
 pub use sample::{Interpolation, Sampler};
+pub use sweep::{extend_field, sweep_distance};
 pub use violation::{Violation, ViolationKind};
 
 use crate::grid::{Grid, Transform};

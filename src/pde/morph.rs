@@ -166,8 +166,8 @@ impl Work for Difference<'_> {
                     #[inline(always)]
                     |x, y, bits| {
                         let at = x * 64 + y * 8;
-                        let load = |leaf: &LeafValues| Lanes::from_slice(simd, &leaf.0[at..at + 16]);
-                        let difference = load(phi) - load(target);
+                        let (phi, target) = (&phi.0[at..at + 16], &target.0[at..at + 16]);
+                        let difference = Lanes::from_slice(simd, phi) - Lanes::from_slice(simd, target);
                         difference.store_slice(&mut speed.0[at..at + 16]);
                         let moving = mask32x16::from_bitmask(simd, u64::from(bits));
                         fastest = fastest.max(moving.select(difference.abs(), zero));

@@ -5,6 +5,7 @@
 //! divided by the voxel size) unless the name says otherwise.
 
 pub mod curvature;
+pub mod eikonal;
 mod halo;
 pub mod normals;
 pub mod simd;
