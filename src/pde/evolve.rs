@@ -46,19 +46,16 @@ pub struct Report {
 /// Most steps of one flow: a time that needs more was meant otherwise.
 const MOST_STEPS: f64 = 1e6;
 
-/// Part of a step by which a time may exceed a whole number of steps without one more: rounding of its sums.
-const WHOLE_STEPS: f64 = 1e-9;
-
 /// What the time loop drives.
 pub(super) trait Motion {
-    /// Looks at the field before a step and returns the largest stable time step, or `None` if nothing moves any more.
-    fn prepare(&mut self, tracker: &Tracker) -> Option<f64>;
+    /// Looks at the field and returns the next time step, at most `left`; `None` if nothing moves any more.
+    fn prepare(&mut self, tracker: &Tracker, left: f64) -> Option<f64>;
 
-    /// Moves the surface by a time step, up to the one that `prepare` allowed.
+    /// Moves the surface by that time step.
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()>;
 }
 
-/// The time loop: steps and tracks until it is time to stop. Steps are equal parts of the time that remains.
+/// The time loop: steps and tracks until it is time to stop.
 pub(super) fn drive(tracker: &mut Tracker, motion: &mut impl Motion, until: Until) -> Result<Report> {
     let (most, end) = match until {
         Until::Iterations(n) => (n, f64::INFINITY),
@@ -78,27 +75,22 @@ pub(super) fn drive(tracker: &mut Tracker, motion: &mut impl Motion, until: Unti
             report.stopped = StopReason::NothingLeft;
             break;
         }
-        let Some(largest) = motion.prepare(tracker) else {
+        let left = end - report.time;
+        let Some(dt) = motion.prepare(tracker, left) else {
             report.stopped = StopReason::AtRest;
             break;
         };
-        let (dt, steps_left) = if end.is_finite() {
-            let left = (end - report.time) / largest;
-            if left + f64::from(report.steps) > MOST_STEPS {
-                let accepted = format!("0 to {} at this voxel size", largest * MOST_STEPS);
-                return Err(EditError::parameter("evolve", "time", end, accepted));
-            }
-            let steps = (left - WHOLE_STEPS).ceil().max(1.0);
-            ((end - report.time) / steps, steps as u32)
-        } else {
-            (largest, most - report.steps)
-        };
+        if end.is_finite() && left / dt > MOST_STEPS {
+            let accepted = format!("0 to {} at this voxel size", dt * MOST_STEPS);
+            return Err(EditError::parameter("evolve", "time", end, accepted));
+        }
+        let steps_left = if end.is_finite() { (left / dt).ceil() as u32 } else { most - report.steps };
         let task = task.get_or_insert_with(|| run.task("evolving", u64::from(steps_left)));
         motion.step(tracker, dt)?;
         tracker.track()?;
         report.steps += 1;
         // Not the sum of the steps, which rounding may leave short of the end.
-        report.time = if end.is_finite() && steps_left == 1 { end } else { report.time + dt };
+        report.time = if dt == left { end } else { report.time + dt };
         report.voxels = tracker.moving_voxels();
         task.advance(1);
     }
@@ -119,6 +111,9 @@ pub fn evolve(
     drive(&mut tracker, &mut Flow { function, voxel_size }, until)
 }
 
+/// Part of a step by which a time may exceed a whole number of steps without one more.
+const WHOLE_STEPS: f64 = 1e-9;
+
 /// The motion that a speed function describes.
 struct Flow<'a> {
     function: &'a dyn SpeedFunction,
@@ -126,8 +121,13 @@ struct Flow<'a> {
 }
 
 impl Motion for Flow<'_> {
-    fn prepare(&mut self, _: &Tracker) -> Option<f64> {
-        Some(self.function.largest_step(self.voxel_size))
+    fn prepare(&mut self, _: &Tracker, left: f64) -> Option<f64> {
+        let largest = self.function.largest_step(self.voxel_size);
+        if left.is_infinite() {
+            return Some(largest);
+        }
+        // Equal parts of the time, as few as may be. Rounding of the sum of steps must not make it one more.
+        Some(left / (left / largest - WHOLE_STEPS).ceil().max(1.0))
     }
 
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {

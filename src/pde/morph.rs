@@ -108,7 +108,7 @@ struct Morph<'a> {
 }
 
 impl Motion for Morph<'_> {
-    fn prepare(&mut self, tracker: &Tracker) -> Option<f64> {
+    fn prepare(&mut self, tracker: &Tracker, left: f64) -> Option<f64> {
         let pages = tracker.grid().value_pages().page_count();
         self.speed.truncate(pages);
         self.speed.grow(pages, LeafValues::default());
@@ -130,7 +130,8 @@ impl Motion for Morph<'_> {
             TimeIntegrator::TvdRk3 => 1.0,
         };
         let voxel_size = tracker.voxel_size();
-        (fastest > AT_REST * voxel_size).then(|| courant / 3f64.sqrt() * f64::from(voxel_size) / f64::from(fastest))
+        let largest = courant / 3f64.sqrt() * f64::from(voxel_size) / f64::from(fastest);
+        (fastest > AT_REST * voxel_size).then_some(largest.min(left))
     }
 
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
