@@ -26,6 +26,11 @@ pub fn renormalize(level_set: &mut LevelSet, solver: &SolverOptions, run: &RunOp
 impl Tracker<'_> {
     /// Renormalises the domain `solver.normalizations` times.
     pub fn renormalize(&mut self) -> Result<()> {
+        self.renormalize_to(Target::Repairable)
+    }
+
+    /// Renormalises the domain `solver.normalizations` times, the last time with target `last`.
+    pub(super) fn renormalize_to(&mut self, last: Target) -> Result<()> {
         let SolverOptions { scheme, integrator, normalizations, weno_epsilon } = self.solver;
         let voxel_size = self.voxel_size();
         // The steps of OpenVDB's LevelSetTracker: the largest that stay stable with each scheme.
@@ -35,13 +40,36 @@ impl Tracker<'_> {
             TimeIntegrator::TvdRk3 => 1.0,
         };
         let step = RenormalizationStep { dt: courant * voxel_size, voxel_size };
-        for _ in 0..normalizations {
+        for n in 1..=normalizations {
+            let target = if n == normalizations { last } else { Target::Repairable };
             match scheme {
-                UpwindScheme::First => self.integrate(&FirstOrder(step), integrator, Target::Repairable)?,
-                UpwindScheme::HjWeno5 => self.integrate(&Weno5(step, weno_epsilon), integrator, Target::Repairable)?,
+                UpwindScheme::First => self.integrate(&FirstOrder(step), integrator, target)?,
+                UpwindScheme::HjWeno5 => self.integrate(&Weno5(step, weno_epsilon), integrator, target)?,
             }
         }
+        if normalizations == 0 && last == Target::Trimmed {
+            self.trim_band()?;
+        }
         Ok(())
+    }
+
+    /// Deactivates the voxels of the domain that lie outside the band, sets them to ±background, and removes empty leaves.
+    pub fn trim_band(&mut self) -> Result<()> {
+        self.integrate(&Unchanged, TimeIntegrator::TvdRk1, Target::Trimmed)
+    }
+}
+
+/// No renormalisation: trimming alone.
+struct Unchanged;
+
+impl LeafKernel for Unchanged {
+    type Scratch = ();
+
+    fn scratch(&self) {}
+
+    #[inline(always)]
+    fn euler<S: Simd>(&self, _: S, grid: &Grid, id: LeafId, _: LeafMask, (): &mut (), out: &mut LeafValues) {
+        out.0 = grid.values(id).0;
     }
 }
 

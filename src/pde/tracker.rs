@@ -1,5 +1,7 @@
 //! A level set on the move: the grid, its second buffers, the domain and how it is solved.
 
+use rayon::prelude::*;
+
 use super::domain::Domain;
 use super::step::{Blend, LeafKernel, Target};
 use super::{SolverOptions, TimeIntegrator};
@@ -53,7 +55,8 @@ impl<'a> Tracker<'a> {
 
     /// Active voxels that the domain lets move.
     pub fn moving_voxels(&self) -> u64 {
-        self.domain.leaves().iter().map(|id| u64::from(self.domain.moving(id, self.grid.mask(id)).count())).sum()
+        let count = |id| u64::from(self.domain.moving(id, self.grid.mask(id)).count());
+        self.domain.leaves().par_pages().map(|leaves| leaves.iter().map(count).sum::<u64>()).sum()
     }
 
     /// Exchanges φ with second buffer `i`.
@@ -79,19 +82,28 @@ impl<'a> Tracker<'a> {
         target: Target,
     ) -> Result<()> {
         self.need_buffers(if integrator == TimeIntegrator::TvdRk3 { 2 } else { 1 });
-        let mut euler = |from: Option<usize>, to: usize, blend: Blend| {
-            self.step_into(kernel, target, from, to, blend);
+        // Only the last stage trims.
+        let stage = if target == Target::Trimmed { Target::Repairable } else { target };
+        let mut euler = |target, from: Option<usize>, to: usize, blend: Blend| {
+            let emptied = self.step_into(kernel, target, from, to, blend);
             self.exchange(to);
+            emptied
         };
         // After an exchange the buffer just written is φ, and what was φ lies in its place.
-        euler(None, 0, Blend::NEW);
-        match integrator {
-            TimeIntegrator::TvdRk1 => {}
-            TimeIntegrator::TvdRk2 => euler(None, 0, Blend { old: 0.5, new: 0.5 }),
-            TimeIntegrator::TvdRk3 => {
-                euler(Some(0), 1, Blend { old: 0.75, new: 0.25 });
-                euler(None, 0, Blend { old: 1.0 / 3.0, new: 2.0 / 3.0 });
+        let emptied = match integrator {
+            TimeIntegrator::TvdRk1 => euler(target, None, 0, Blend::NEW),
+            TimeIntegrator::TvdRk2 => {
+                euler(stage, None, 0, Blend::NEW);
+                euler(target, None, 0, Blend { old: 0.5, new: 0.5 })
             }
+            TimeIntegrator::TvdRk3 => {
+                euler(stage, None, 0, Blend::NEW);
+                euler(stage, Some(0), 1, Blend { old: 0.75, new: 0.25 });
+                euler(target, None, 0, Blend { old: 1.0 / 3.0, new: 2.0 / 3.0 })
+            }
+        };
+        if target == Target::Trimmed {
+            self.settle(&emptied);
         }
         self.run.check("stepping the level set")
     }
