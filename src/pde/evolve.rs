@@ -47,7 +47,7 @@ const MOST_STEPS: f64 = 1e6;
 /// Moves a surface by φ_t = −F|∇φ|, everywhere or weighted by a region, tracking the band after each step.
 pub fn evolve(
     level_set: &mut LevelSet,
-    function: &dyn SpeedFunction,
+    function: &impl SpeedFunction,
     region: Option<&dyn Region>,
     until: Until,
     solver: &SolverOptions,

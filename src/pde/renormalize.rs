@@ -16,7 +16,7 @@ use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 use crate::stencil::simd::Lanes;
 use crate::stencil::upwind::{UpwindScheme, WenoEpsilon, godunov_first, godunov_weno5};
-use crate::stencil::{Halo, StarHalo};
+use crate::stencil::{FaceHalo, StarHalo};
 
 /// Renormalises the whole band `solver.normalizations` times. The band itself stays as it is.
 pub fn renormalize(level_set: &mut LevelSet, solver: &SolverOptions, run: &RunOptions) -> Result<()> {
@@ -93,21 +93,29 @@ impl RenormalizationStep {
 struct FirstOrder(RenormalizationStep);
 
 impl LeafKernel for FirstOrder {
-    type Scratch = Halo;
+    type Scratch = FaceHalo;
 
-    fn scratch(&self) -> Halo {
-        Halo::new()
+    fn scratch(&self) -> FaceHalo {
+        FaceHalo::new()
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, halo: &mut Halo, out: &mut LeafValues) {
+    fn euler<S: Simd>(
+        &self,
+        simd: S,
+        grid: &Grid,
+        id: LeafId,
+        rows: LeafMask,
+        halo: &mut FaceHalo,
+        out: &mut LeafValues,
+    ) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         rows.for_each_pair(
             #[inline(always)]
             |x, y, _| {
                 let at = x * 64 + y * 8;
-                let phi = halo.rows(simd, x, y, [0; 3]);
-                self.0.euler(simd, phi, godunov_first(simd, halo, x, y)).store_slice(&mut out.0[at..at + 16]);
+                let phi = halo.centre(simd, x, y);
+                self.0.euler(simd, phi, godunov_first(simd, halo, x, y, phi)).store_slice(&mut out.0[at..at + 16]);
             },
         );
     }
@@ -139,7 +147,7 @@ impl LeafKernel for Weno5 {
                 let at = x * 64 + y * 8;
                 let phi = halo.centre(simd, x, y);
                 self.0
-                    .euler(simd, phi, godunov_weno5(simd, halo, x, y, self.0.voxel_size, self.1))
+                    .euler(simd, phi, godunov_weno5(simd, halo, x, y, phi, self.0.voxel_size, self.1))
                     .store_slice(&mut out.0[at..at + 16]);
             },
         );

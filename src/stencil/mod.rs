@@ -9,4 +9,4 @@ mod halo;
 pub mod simd;
 pub mod upwind;
 
-pub use halo::{Halo, Row, StarHalo};
+pub use halo::{FaceHalo, Halo, LeafHalo, Row, StarHalo};
