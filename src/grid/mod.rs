@@ -229,7 +229,7 @@ impl Grid {
         }
         let topology = Arc::make_mut(&mut self.topology);
         let added = topology.insert(origins);
-        self.values.grow(topology.page_count(), LeafValues::filled(self.background));
+        self.values.grow_unwritten(topology.page_count());
         self.masks.grow(topology.page_count(), LeafMask::EMPTY);
         for &(id, sentinel) in &added {
             let value = if sentinel == LeafId::INSIDE { -self.background } else { self.background };
@@ -242,13 +242,10 @@ impl Grid {
     /// Removes those of `candidates` that have no active voxel and one sign, which stays known.
     pub fn prune(&mut self, candidates: &LeafSet) -> Vec<LeafId> {
         let removed: Vec<_> = candidates
-            .iter()
+            .par_pages()
+            .flat_map_iter(PageLeaves::iter)
             .filter(|&id| self.mask(id).is_empty())
-            .filter_map(|id| {
-                let values = &self.values(id).0;
-                let inside = values[0] < 0.0;
-                values.iter().all(|v| (*v < 0.0) == inside).then_some((id, LeafId::sentinel(inside)))
-            })
+            .filter_map(|id| Some((id, LeafId::sentinel(self.values(id).one_sign()?))))
             .collect();
         if !removed.is_empty() {
             Arc::make_mut(&mut self.topology).remove(&removed);

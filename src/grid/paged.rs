@@ -111,6 +111,16 @@ impl<T: Pooled> Paged<T> {
         }
     }
 
+    /// Appends pages that hold anything until there are `pages`: for slots that are written before they are read.
+    pub fn grow_unwritten(&mut self, pages: usize)
+    where
+        T: Default,
+    {
+        while self.pages.len() < pages {
+            self.pages.push(T::used_page().unwrap_or_else(|| Self::page_of(T::default())));
+        }
+    }
+
     /// Drops the pages from `pages` on.
     pub fn truncate(&mut self, pages: usize) {
         self.pages.truncate(pages);

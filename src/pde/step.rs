@@ -53,9 +53,10 @@ impl Blend {
     pub const NEW: Self = Self { old: 0.0, new: 1.0 };
 }
 
-/// Row pairs of a leaf that lost their last active voxel, bit `4x + y/2` each.
+/// What trimming a leaf leaves to be done.
 pub(super) struct Emptied {
     pub id: LeafId,
+    /// Row pairs without an active voxel whose values differ from those before the step, bit `4x + y/2` each.
     pub pairs: u32,
 }
 
@@ -74,6 +75,7 @@ impl Tracker<'_> {
         let mut out = std::mem::take(&mut self.buffers[to]);
         // Its masks are lent to the tasks, page by page.
         let mut masks = if target == Target::Trimmed { self.grid.take_masks() } else { Paged::default() };
+        let several_buffers = self.buffers.len() > 1;
         let old = from.map(|i| &self.buffers[i]);
         let (grid, domain, run) = (&*self.grid, &self.domain, self.run);
         // All tasks read the neighbours: computed before they start, not by the first of them.
@@ -98,6 +100,7 @@ impl Tracker<'_> {
                     new_page,
                     page,
                     masks,
+                    several_buffers,
                     emptied,
                 });
             }
@@ -131,6 +134,8 @@ struct PageStep<'a, K> {
     page: &'a mut [LeafValues],
     /// The masks of the page, if the step trims.
     masks: Option<&'a mut [LeafMask]>,
+    /// Whether other buffers than φ and this one are to be kept in step.
+    several_buffers: bool,
     emptied: &'a mut Vec<Emptied>,
 }
 
@@ -140,6 +145,7 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
         let mut scratch = self.kernel.scratch();
         let mut new = LeafValues::default();
         let background = Lanes::splat(simd, self.grid.background());
+        let several = self.several_buffers;
         self.leaves.for_each(
             #[inline(always)]
             |id| {
@@ -179,14 +185,18 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
                             value = outside.select(background.copysign(value), value);
                             let trimmed = outside.to_bitmask() & u64::from(bits);
                             mask.0[x] &= !(trimmed << (8 * y));
-                            emptied |= u32::from(mask.0[x] >> (8 * y) & 0xffff == 0) << (4 * x + y / 2);
+                            if mask.0[x] >> (8 * y) & 0xffff == 0
+                                && (several || value.simd_eq(now).to_bitmask() & u64::from(bits) != u64::from(bits))
+                            {
+                                emptied |= 1 << (4 * x + y / 2);
+                            }
                         }
                         // The other voxels of the rows take φ's value: so trimmed ones need no care of their own.
                         let mask = mask32x16::from_bitmask(simd, u64::from(bits));
                         mask.select(value, now).store_slice(&mut out.0[at..at + 16]);
                     },
                 );
-                if emptied != 0 {
+                if emptied != 0 || mask.is_some_and(|mask| mask.is_empty()) {
                     self.emptied.push(Emptied { id, pairs: emptied });
                 }
             },

@@ -4,7 +4,7 @@ use super::SolverOptions;
 use super::step::{Emptied, Target};
 use super::tracker::Tracker;
 use crate::error::Result;
-use crate::grid::{Face, LeafId, LeafMask, LeafSet, LeafValues, Paged, neighbour_index};
+use crate::grid::{Face, LeafId, LeafMask, LeafSet, Paged, neighbour_index};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 
@@ -25,7 +25,7 @@ impl Tracker<'_> {
         let added = self.grid.add_leaves(&self.grid.absent_beside(&self.moving()));
         let pages = self.grid.value_pages().page_count();
         for buffer in &mut self.buffers {
-            buffer.grow(pages, LeafValues::default());
+            buffer.grow_unwritten(pages);
             for &id in &added {
                 buffer.get_mut(id).clone_from(self.grid.values(id));
             }
@@ -40,7 +40,7 @@ impl Tracker<'_> {
         self.grid.activate_beside(&moving, self.domain.leaves());
     }
 
-    /// After a trimming step: puts the second buffers in step with φ, and removes the leaves that were left empty. `emptied` is sorted.
+    /// After a trimming step: puts the second buffers in step with φ, and removes the leaves that were left empty. `emptied` is sorted by leaf.
     pub(super) fn settle(&mut self, emptied: &[Emptied]) {
         let touched: LeafSet = emptied.iter().map(|e| e.id).collect();
         let grid = &*self.grid;

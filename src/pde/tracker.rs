@@ -1,15 +1,17 @@
 //! A level set on the move: the grid, its second buffers, the domain and how it is solved.
 
+use fearless_simd::Simd;
 use rayon::prelude::*;
 
 use super::domain::Domain;
 use super::step::{Blend, LeafKernel, Target};
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::Result;
-use crate::grid::{Grid, LeafValues, Paged, Transform};
+use crate::grid::{Grid, LeafValues, PageLeaves, Paged, Transform};
 use crate::levelset::LevelSet;
 use crate::region::{Region, RegionWeights};
 use crate::run::RunOptions;
+use crate::stencil::simd::{Work, dispatch};
 
 /// Steps a level set and keeps its band on the surface (OpenVDB's word for it).
 ///
@@ -55,8 +57,13 @@ impl<'a> Tracker<'a> {
 
     /// Active voxels that the domain lets move.
     pub fn moving_voxels(&self) -> u64 {
-        let count = |id| u64::from(self.domain.moving(id, self.grid.mask(id)).count());
-        self.domain.leaves().par_pages().map(|leaves| leaves.iter().map(count).sum::<u64>()).sum()
+        let (grid, domain) = (&*self.grid, &self.domain);
+        let count = |leaves| {
+            let mut voxels = 0;
+            dispatch(CountMoving { grid, domain, leaves, voxels: &mut voxels });
+            voxels
+        };
+        domain.leaves().par_pages().map(count).sum()
     }
 
     /// Exchanges φ with second buffer `i`.
@@ -106,5 +113,23 @@ impl<'a> Tracker<'a> {
             self.settle(&emptied);
         }
         self.run.check("stepping the level set")
+    }
+}
+
+/// Counts the active voxels of a page that move. As vector work because bits are counted one by one otherwise.
+struct CountMoving<'a> {
+    grid: &'a Grid,
+    domain: &'a Domain,
+    leaves: PageLeaves,
+    voxels: &'a mut u64,
+}
+
+impl Work for CountMoving<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        self.leaves.for_each(
+            #[inline(always)]
+            |id| *self.voxels += u64::from(self.domain.moving(id, self.grid.mask(id)).count()),
+        );
     }
 }

@@ -40,6 +40,7 @@ impl Halo {
     /// Copies the leaf in the middle of `around` and the rim from its 26 neighbours.
     #[inline(always)]
     pub fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
+        let leaves = leaves(values, around);
         for x in 0..10 {
             // The neighbour in x, and the slab of it.
             let (i, from) = match x {
@@ -47,7 +48,7 @@ impl Halo {
                 9 => (2, 0),
                 _ => (1, x - 1),
             };
-            let leaf = |q: usize| slab(&values.get(around[i * 9 + q]).0, from);
+            let leaf = |q: usize| slab(leaves[i * 9 + q], from);
             let [low, middle, high] = &mut self.slabs;
             let slabs = &mut [&mut low[x], &mut middle[x], &mut high[x]];
             fill::<8>(slabs, 0, [&leaf(0)[56..], &leaf(1)[56..], &leaf(2)[56..]]);
@@ -128,18 +129,22 @@ impl<const REACH: usize> StarHalo<REACH> {
     /// Copies the leaf in the middle of `around` and the voxels beyond each of its faces.
     #[inline(always)]
     pub fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
-        let leaf = |q: usize| &values.get(around[q]).0;
+        // Looked up once each: neighbours along the axes, before and after.
+        let [centre, xm, xp, ym, yp, zm, zp] = [13, 4, 22, 10, 16, 12, 14].map(
+            #[inline(always)]
+            |q: usize| &values.get(around[q]).0,
+        );
         for x in 0..REACH {
-            self.slabs[2 - x][24..88].copy_from_slice(slab(leaf(4), 7 - x));
-            self.slabs[11 + x][24..88].copy_from_slice(slab(leaf(22), x));
+            self.slabs[2 - x][24..88].copy_from_slice(slab(xm, 7 - x));
+            self.slabs[11 + x][24..88].copy_from_slice(slab(xp, x));
         }
         let rim = 8 * REACH;
         for x in 0..8 {
-            let (own, below, above) = (slab(leaf(13), x), slab(leaf(12), x), slab(leaf(14), x));
+            let (own, below, above) = (slab(centre, x), slab(zm, x), slab(zp, x));
             let rows = &mut self.slabs[3 + x];
-            rows[24 - rim..24].copy_from_slice(&slab(leaf(10), x)[64 - rim..]);
+            rows[24 - rim..24].copy_from_slice(&slab(ym, x)[64 - rim..]);
             rows[24..88].copy_from_slice(own);
-            rows[88..88 + rim].copy_from_slice(&slab(leaf(16), x)[..rim]);
+            rows[88..88 + rim].copy_from_slice(&slab(yp, x)[..rim]);
             let [m1, p1, m2, p2, m3, p3] = &mut self.shifted;
             shift_up::<64, 1>(&mut m1[x], own, below);
             shift_down::<64, 1>(&mut p1[x], own, above);
@@ -204,6 +209,15 @@ impl<const REACH: usize> Default for StarHalo<REACH> {
     fn default() -> Self {
         Self::new()
     }
+}
+
+/// The values of a leaf and its neighbours.
+#[inline(always)]
+fn leaves<'a>(values: &'a Paged<LeafValues>, around: &Neighbours) -> [&'a [f32; LEAF_VOXELS]; 27] {
+    around.map(
+        #[inline(always)]
+        |id| &values.get(id).0,
+    )
 }
 
 /// The 64 values of slab x of a leaf.

@@ -49,29 +49,38 @@ pub fn godunov_weno5<S: Simd>(
     voxel_size: f32,
     epsilon: WenoEpsilon,
 ) -> Lanes<S> {
-    let scale = 1.0 / (voxel_size * voxel_size);
-    let zero = Lanes::splat(simd, 0.0);
     let (centre, sign) = (halo.centre(simd, x, y), mirror(simd, direction));
-    let mut sum = zero;
-    for axis in 0..3 {
-        let [m3, m2, m1, p1, p2, p3] = halo.along(simd, x, y, axis);
-        let (v1, v2, v3) = ((m2 - m3) * sign, (m1 - m2) * sign, (centre - m1) * sign);
-        let (v4, v5, v6) = ((p1 - centre) * sign, (p2 - p1) * sign, (p3 - p2) * sign);
-        // A side counts only where its difference has the right sign. WENO5's is a mean of three candidates: where all of them
-        // have the wrong one, so has it, and is not needed. Of a distance that is one side nearly everywhere.
-        let (behind, ahead) = ([v1, v2, v3, v4, v5], [v6, v5, v4, v3, v2]);
-        let [a1, a2, a3] = candidates(behind);
-        let [b1, b2, b3] = candidates(ahead);
-        let (mut before, mut after) = (zero, zero);
-        if a1.max(a2).max(a3).simd_gt(zero).any_true() {
-            before = weno5(simd, behind, scale, epsilon);
-        }
-        if b1.min(b2).min(b3).simd_lt(zero).any_true() {
-            after = weno5(simd, ahead, scale, epsilon);
-        }
-        sum += godunov(simd, before, after);
+    let scale = 1.0 / (voxel_size * voxel_size);
+    godunov_weno5_axis(simd, centre, halo.along(simd, x, y, 0), sign, scale, epsilon)
+        + godunov_weno5_axis(simd, centre, halo.along(simd, x, y, 1), sign, scale, epsilon)
+        + godunov_weno5_axis(simd, centre, halo.along(simd, x, y, 2), sign, scale, epsilon)
+}
+
+/// One axis of Godunov's |Dφ|² by HJ-WENO5 differences, from the values at −3, −2, −1, 1, 2, 3.
+#[inline(always)]
+fn godunov_weno5_axis<S: Simd>(
+    simd: S,
+    centre: Lanes<S>,
+    [m3, m2, m1, p1, p2, p3]: [Lanes<S>; 6],
+    sign: Lanes<S>,
+    scale: f32,
+    epsilon: WenoEpsilon,
+) -> Lanes<S> {
+    let zero = Lanes::splat(simd, 0.0);
+    let (v1, v2, v3) = ((m2 - m3) * sign, (m1 - m2) * sign, (centre - m1) * sign);
+    let (v4, v5, v6) = ((p1 - centre) * sign, (p2 - p1) * sign, (p3 - p2) * sign);
+    // A side counts only where its difference has the right sign. WENO5's is a mean of three candidates: where all of them have
+    // the wrong one, so has it, and is not needed. Of a distance that is one side nearly everywhere.
+    let (behind, ahead) = ([v1, v2, v3, v4, v5], [v6, v5, v4, v3, v2]);
+    let ([a1, a2, a3], [b1, b2, b3]) = (candidates(behind), candidates(ahead));
+    let (mut before, mut after) = (zero, zero);
+    if a1.max(a2).max(a3).simd_gt(zero).any_true() {
+        before = weno5(simd, behind, scale, epsilon);
     }
-    sum
+    if b1.min(b2).min(b3).simd_lt(zero).any_true() {
+        after = weno5(simd, ahead, scale, epsilon);
+    }
+    godunov(simd, before, after)
 }
 
 /// 1 where the direction is positive, else −1: for F ≤ 0 the mirrored field −φ obeys the rule for F > 0.
