@@ -18,7 +18,7 @@ use crate::grid::{
     Face, Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafSet, LeafValues, PageLeaves, Paged, neighbour_index,
 };
 use crate::run::RunOptions;
-use crate::stencil::Halo;
+use crate::stencil::FaceHalo;
 use crate::stencil::eikonal::{extend, seeds, solve, upwind_neighbours};
 use crate::stencil::simd::{Lanes, Work, dispatch};
 
@@ -187,7 +187,7 @@ struct Seed<'a> {
 impl Work for Seed<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let mut halo = Halo::new();
+        let mut halo = FaceHalo::new();
         let far = Lanes::splat(simd, self.background);
         // A distance of 0 must not lose its sign.
         let least = Lanes::splat(simd, f32::MIN_POSITIVE);
@@ -201,7 +201,7 @@ impl Work for Seed<'_> {
                     #[inline(always)]
                     |x, y, _| {
                         let at = x * 64 + y * 8;
-                        let phi = halo.rows(simd, x, y, [0; 3]);
+                        let phi = halo.centre(simd, x, y);
                         let found = seeds(simd, &halo, x, y, self.voxel_size);
                         let distance = merge(simd, found.beside, found.distance.max(least).min(far), far);
                         let inside = phi.simd_lt(Lanes::splat(simd, 0.0));
@@ -226,7 +226,7 @@ struct Round<'a> {
 impl Work for Round<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let mut halo = Halo::new();
+        let mut halo = FaceHalo::new();
         let least_step = Lanes::splat(simd, LEAST_STEP * self.voxel_size);
         self.leaves.for_each(
             #[inline(always)]
@@ -239,7 +239,7 @@ impl Work for Round<'_> {
                     #[inline(always)]
                     |x, y, free| {
                         let at = x * 64 + y * 8;
-                        let old = halo.rows(simd, x, y, [0; 3]);
+                        let old = halo.centre(simd, x, y);
                         let neighbours = upwind_neighbours(simd, &halo, x, y);
                         let nearest = neighbours[0].min(neighbours[1]).min(neighbours[2]);
                         // Values only fall: where no neighbour is far enough below, there is nothing to do.
@@ -273,7 +273,7 @@ struct Known<'a> {
 impl Work for Known<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let mut halo = Halo::new();
+        let mut halo = FaceHalo::new();
         let zero = Lanes::splat(simd, 0.0);
         self.leaves.for_each(
             #[inline(always)]
@@ -309,7 +309,7 @@ struct ExtensionRound<'a> {
 impl Work for ExtensionRound<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let (mut distance, mut field) = (Halo::new(), Halo::new());
+        let (mut distance, mut field) = (FaceHalo::new(), FaceHalo::new());
         self.leaves.for_each(
             #[inline(always)]
             |id| {
@@ -323,7 +323,7 @@ impl Work for ExtensionRound<'_> {
                     #[inline(always)]
                     |x, y, bits| {
                         let at = x * 64 + y * 8;
-                        let old = field.rows(simd, x, y, [0; 3]);
+                        let old = field.centre(simd, x, y);
                         let new = merge(simd, bits, extend(simd, &distance, &field, x, y), old);
                         any |= new.simd_eq(old).to_bitmask() != 0xffff;
                         new.store_slice(&mut out.0[at..at + 16]);

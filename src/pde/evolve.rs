@@ -100,7 +100,7 @@ pub(super) fn drive(tracker: &mut Tracker, motion: &mut impl Motion, until: Unti
 /// Moves a surface by φ_t = −F|∇φ|, everywhere or weighted by a region, tracking the band after each step.
 pub fn evolve(
     level_set: &mut LevelSet,
-    function: &dyn SpeedFunction,
+    function: &impl SpeedFunction,
     region: Option<&dyn Region>,
     until: Until,
     solver: &SolverOptions,
@@ -115,12 +115,12 @@ pub fn evolve(
 const WHOLE_STEPS: f64 = 1e-9;
 
 /// The motion that a speed function describes.
-struct Flow<'a> {
-    function: &'a dyn SpeedFunction,
+struct Flow<'a, F> {
+    function: &'a F,
     voxel_size: f64,
 }
 
-impl Motion for Flow<'_> {
+impl<F: SpeedFunction> Motion for Flow<'_, F> {
     fn prepare(&mut self, _: &Tracker, left: f64) -> Option<f64> {
         let largest = self.function.largest_step(self.voxel_size);
         if left.is_infinite() {

@@ -15,7 +15,7 @@ mod tracker;
 pub use evolve::{Report, StopReason, Until, evolve};
 pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
-pub use speed::{GradientNorm, LeafFields, SpeedFunction, WantedFields};
+pub use speed::SpeedFunction;
 pub use track::track;
 pub use tracker::Tracker;
 

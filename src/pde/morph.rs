@@ -25,7 +25,7 @@ use crate::region::Region;
 use crate::run::RunOptions;
 use crate::stencil::simd::{Lanes, Work, dispatch};
 use crate::stencil::upwind::{UpwindScheme, WenoEpsilon, godunov_first, godunov_weno5};
-use crate::stencil::{Halo, StarHalo};
+use crate::stencil::{FaceHalo, StarHalo};
 
 /// The product that approximates F|∇φ|.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -242,20 +242,28 @@ impl MorphStep<'_> {
 struct FirstOrder<'a>(MorphStep<'a>);
 
 impl LeafKernel for FirstOrder<'_> {
-    type Scratch = Halo;
+    type Scratch = FaceHalo;
 
-    fn scratch(&self) -> Halo {
-        Halo::new()
+    fn scratch(&self) -> FaceHalo {
+        FaceHalo::new()
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, halo: &mut Halo, out: &mut LeafValues) {
+    fn euler<S: Simd>(
+        &self,
+        simd: S,
+        grid: &Grid,
+        id: LeafId,
+        rows: LeafMask,
+        halo: &mut FaceHalo,
+        out: &mut LeafValues,
+    ) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         rows.for_each_pair(
             #[inline(always)]
             |x, y, _| {
                 let at = x * 64 + y * 8;
-                let (phi, speed) = (halo.rows(simd, x, y, [0; 3]), self.0.speed(simd, id, x, y));
+                let (phi, speed) = (halo.centre(simd, x, y), self.0.speed(simd, id, x, y));
                 let norm2 = godunov_first(simd, halo, x, y, self.0.direction(phi, speed));
                 self.0.euler(phi, speed, norm2).store_slice(&mut out.0[at..at + 16]);
             },

@@ -7,7 +7,7 @@
 
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
 
-use super::Halo;
+use super::LeafHalo;
 use super::simd::Lanes;
 
 /// Below this |∇φ| a central difference says nothing of the distance to the surface.
@@ -27,16 +27,13 @@ pub struct Seeds<S: Simd> {
 ///
 /// with the central gradient; second order where φ is smooth, and never farther than the surface is on a grid line.
 #[inline(always)]
-pub fn seeds<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Seeds<S> {
-    let phi = halo.rows(simd, x, y, [0; 3]);
+pub fn seeds<S: Simd>(simd: S, halo: &impl LeafHalo, x: usize, y: usize, voxel_size: f32) -> Seeds<S> {
+    let phi = halo.centre(simd, x, y);
     let zero = Lanes::splat(simd, 0.0);
     let inside = phi.simd_lt(zero).to_bitmask();
     let (mut squared, mut way, mut beside) = (zero, Lanes::splat(simd, voxel_size), 0);
     for axis in 0..3 {
-        let mut step = [0; 3];
-        step[axis] = 1;
-        let after = halo.rows(simd, x, y, step);
-        let before = halo.rows(simd, x, y, step.map(isize::wrapping_neg));
+        let [before, after] = halo.beside(simd, x, y, axis);
         let slope = (after - before) * (0.5 / voxel_size);
         squared += slope * slope;
         for there in [before, after] {
@@ -53,11 +50,14 @@ pub fn seeds<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32)
 
 /// The smaller of |u| at the two neighbours along each axis.
 #[inline(always)]
-pub fn upwind_neighbours<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize) -> [Lanes<S>; 3] {
+pub fn upwind_neighbours<S: Simd>(simd: S, halo: &impl LeafHalo, x: usize, y: usize) -> [Lanes<S>; 3] {
     macro_rules! least {
-        ($($d:literal),*) => { halo.rows(simd, x, y, [$($d),*]).abs().min(halo.rows(simd, x, y, [$(-$d),*]).abs()) };
+        ($axis:literal) => {{
+            let [before, after] = halo.beside(simd, x, y, $axis);
+            before.abs().min(after.abs())
+        }};
     }
-    [least!(1, 0, 0), least!(0, 1, 0), least!(0, 0, 1)]
+    [least!(0), least!(1), least!(2)]
 }
 
 /// u from the smaller neighbour along each axis.
@@ -84,22 +84,20 @@ pub fn solve<S: Simd>(simd: S, [u1, u2, u3]: [Lanes<S>; 3], voxel_size: f32) -> 
 ///
 /// Where no neighbour is smaller it stays what it is.
 #[inline(always)]
-pub fn extend<S: Simd>(simd: S, distance: &Halo, field: &Halo, x: usize, y: usize) -> Lanes<S> {
+pub fn extend<S: Simd>(simd: S, distance: &impl LeafHalo, field: &impl LeafHalo, x: usize, y: usize) -> Lanes<S> {
     let zero = Lanes::splat(simd, 0.0);
-    let here = distance.rows(simd, x, y, [0; 3]).abs();
+    let here = distance.centre(simd, x, y).abs();
     let (mut weights, mut sum) = (zero, zero);
     for axis in 0..3 {
-        let mut step = [0; 3];
-        step[axis] = 1;
-        let back = step.map(isize::wrapping_neg);
-        let (after, before) = (distance.rows(simd, x, y, step).abs(), distance.rows(simd, x, y, back).abs());
-        let value = before.simd_lt(after).select(field.rows(simd, x, y, back), field.rows(simd, x, y, step));
+        let ([before, after], values) = (distance.beside(simd, x, y, axis), field.beside(simd, x, y, axis));
+        let (before, after) = (before.abs(), after.abs());
+        let value = before.simd_lt(after).select(values[0], values[1]);
         let weight = (here - before.min(after)).max(zero);
         weights += weight;
         sum += weight * value;
     }
     let known = weights.simd_gt(zero);
-    known.select(sum / known.select(weights, Lanes::splat(simd, 1.0)), field.rows(simd, x, y, [0; 3]))
+    known.select(sum / known.select(weights, Lanes::splat(simd, 1.0)), field.centre(simd, x, y))
 }
 
 #[cfg(test)]

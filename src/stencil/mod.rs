@@ -11,4 +11,4 @@ pub mod normals;
 pub mod simd;
 pub mod upwind;
 
-pub use halo::{Halo, Row, StarHalo};
+pub use halo::{FaceHalo, Halo, LeafHalo, Row, StarHalo};
