@@ -14,9 +14,7 @@ use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
 
 use super::{Field, LevelSet, background};
 use crate::error::{EditError, Result};
-use crate::grid::{
-    Face, Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafSet, LeafValues, PageLeaves, Paged, neighbour_index,
-};
+use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, LeafSet, LeafValues, PageLeaves, Paged, neighbour_index};
 use crate::run::RunOptions;
 use crate::stencil::FaceHalo;
 use crate::stencil::eikonal::{extend, seeds, solve, upwind_neighbours};
@@ -157,15 +155,14 @@ fn grow(
 
 /// Offsets of the voxels of a leaf that lie on one of its faces.
 fn on_face(face: Face) -> impl Iterator<Item = usize> {
-    let (axis, last) = match face {
-        Face::XMinus => (64, 0),
-        Face::XPlus => (64, 7),
-        Face::YMinus => (8, 0),
-        Face::YPlus => (8, 7),
-        Face::ZMinus => (1, 0),
-        Face::ZPlus => (1, 7),
-    };
-    (0..LEAF_VOXELS).filter(move |offset| offset / axis % 8 == last)
+    (0..64).map(move |i| match face {
+        Face::XMinus => i,
+        Face::XPlus => 7 * 64 + i,
+        Face::YMinus => i / 8 * 64 + i % 8,
+        Face::YPlus => i / 8 * 64 + 7 * 8 + i % 8,
+        Face::ZMinus => i * 8,
+        Face::ZPlus => i * 8 + 7,
+    })
 }
 
 /// The values of two rows with `part` where a bit is set.

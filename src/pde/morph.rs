@@ -111,7 +111,8 @@ impl Motion for Morph<'_> {
     fn prepare(&mut self, tracker: &Tracker, left: f64) -> Option<f64> {
         let pages = tracker.grid().value_pages().page_count();
         self.speed.truncate(pages);
-        self.speed.grow(pages, LeafValues::default());
+        // Rows are written before they are read.
+        self.speed.grow_unwritten(pages);
         let (target, aligned) = (self.target, self.aligned);
         let fastest = self.speed.par_update_pages(tracker.domain.leaves(), |leaves, speed| {
             let mut fastest = 0.0;
