@@ -367,8 +367,7 @@ const CELL_EDGES: [CellEdge; 12] = {
         let (x, y, z) = (corner >> 2, corner >> 1 & 1, corner & 1);
         let from = x as usize * 81 + y as usize * 9 + z as usize;
         let to = from + [81, 9, 1][axis];
-        edges[e] =
-            CellEdge { from, to, start: Vec3::new(x as f32, y as f32, z as f32), direction: Vec3::AXES[axis] };
+        edges[e] = CellEdge { from, to, start: Vec3::new(x as f32, y as f32, z as f32), direction: Vec3::AXES[axis] };
         e += 1;
     }
     edges
@@ -380,11 +379,8 @@ const BLOCKS: [IVec3; 64] = {
     let mut i = 0;
     while i < 64 {
         let (high, low) = (i as i32 >> 3, i as i32 & 7);
-        blocks[i] = IVec3::new(
-            (high >> 2) * 2 + (low >> 2),
-            (high >> 1 & 1) * 2 + (low >> 1 & 1),
-            (high & 1) * 2 + (low & 1),
-        );
+        blocks[i] =
+            IVec3::new((high >> 2) * 2 + (low >> 2), (high >> 1 & 1) * 2 + (low >> 1 & 1), (high & 1) * 2 + (low & 1));
         i += 1;
     }
     blocks

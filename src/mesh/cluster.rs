@@ -85,9 +85,8 @@ impl Cluster {
             let past = u - u.max(zero).min(length);
             let past1 = along1 - along1.max(zero).min(length1);
             let past2 = along2 - along2.max(zero).min(length2);
-            let outside = (w * w + past * past)
-                .min(across1 * across1 + past1 * past1)
-                .min(across2 * across2 + past2 * past2);
+            let outside =
+                (w * w + past * past).min(across1 * across1 + past1 * past1).min(across2 * across2 + past2 * past2);
             let inwards = w.min(across1).min(across2);
             *square = s * s + inwards.simd_ge(zero).select(zero, outside);
         }
@@ -341,9 +340,11 @@ fn times<S: Simd>(a: [Lanes<S>; 3], factor: Lanes<S>) -> [Lanes<S>; 3] {
 /// Three axes square to each other, the first along `direction`, the second as near to a lattice axis as can be.
 fn axes_about(direction: Vec3) -> [Vec3; 3] {
     let normal = direction.try_normalize().unwrap_or(Vec3::X);
-    let (_, least) = normal.to_array().into_iter().enumerate().fold((f32::INFINITY, 0), |(small, at), (k, v)| {
-        if v.abs() < small { (v.abs(), k) } else { (small, at) }
-    });
+    let (_, least) = normal
+        .to_array()
+        .into_iter()
+        .enumerate()
+        .fold((f32::INFINITY, 0), |(small, at), (k, v)| if v.abs() < small { (v.abs(), k) } else { (small, at) });
     let lattice = Vec3::AXES[least];
     // The least component is at most 1/√3: what is left has a length.
     let second = (lattice - normal * normal.dot(lattice)).normalize();
@@ -462,7 +463,8 @@ mod tests {
     use crate::mesh::testing::noise;
 
     fn point(seed: usize, scale: f32) -> Vec3 {
-        Vec3::new(noise(3 * seed) as f32 - 0.5, noise(3 * seed + 1) as f32 - 0.5, noise(3 * seed + 2) as f32 - 0.5) * scale
+        Vec3::new(noise(3 * seed) as f32 - 0.5, noise(3 * seed + 1) as f32 - 0.5, noise(3 * seed + 2) as f32 - 0.5)
+            * scale
     }
 
     /// Down to the thinnest and smallest triangles that marching can make.

@@ -162,9 +162,8 @@ mod tests {
         let mesh = level_set_to_mesh(level_set, what.iso, &RunOptions::default()).unwrap();
         let transform = level_set.transform();
         let voxel_size = level_set.voxel_size();
-        let bvh = Bvh::new(
-            (0..mesh.triangles.len()).map(|t| mesh.corners(t).map(|p| transform.world_to_index(p))).collect(),
-        );
+        let bvh =
+            Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t).map(|p| transform.world_to_index(p))).collect());
         let surface = IsoSurface::new(level_set.grid(), what.iso, "test", &RunOptions::default()).unwrap();
         let half_width = f64::from(what.half_width);
         let (lo, hi) = index_bounds(&surface, level_set.grid(), what.offset.abs() / voxel_size + half_width).unwrap();
