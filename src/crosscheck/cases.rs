@@ -6,13 +6,13 @@ use super::Input;
 use super::contest::{Contest, GridContest, Judge, Operation};
 use crate::error::{EditError, Result};
 use crate::grid::Transform;
-use crate::levelset::LevelSet;
+use crate::levelset::{LevelSet, sweep_distance};
 use crate::mesh::{MeshToLevelSet, Rebuild, mesh_to_level_set, rebuild};
 use crate::ops::csg::{CsgOperation, csg};
 use crate::ops::morphology::offset;
 use crate::ops::smooth::{Smooth, SmoothMethod, smooth};
 use crate::ops::{EvolutionOptions, Like, Scheme};
-use crate::pde::{SolverOptions, UpwindScheme, WenoEpsilon, renormalize, track};
+use crate::pde::{MorphOptions, SolverOptions, Until, UpwindScheme, WenoEpsilon, morph_towards, renormalize, track};
 use crate::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceScheme, Tracker};
 
 /// A row of the table.
@@ -49,6 +49,12 @@ pub(super) const CASES: &[Case] = &[
         contest: exact_offset,
     },
     Case {
+        operator: "morph",
+        scheme: "towards a copy one voxel larger, time 1, HJ-WENO5, RK2; track HJ-WENO5, RK1, 3",
+        tolerance: 1e-3,
+        contest: morph,
+    },
+    Case {
         operator: "csg-union",
         scheme: "with a copy shifted by half its size, against csgUnionCopy",
         tolerance: 0.0,
@@ -59,6 +65,18 @@ pub(super) const CASES: &[Case] = &[
         scheme: "half width 3, against levelSetRebuild",
         tolerance: 0.05,
         contest: exact_rebuild,
+    },
+    Case {
+        operator: "sweep",
+        scheme: "distances again in the same band, first order, against sdfToSdf",
+        tolerance: 0.5,
+        contest: sweep,
+    },
+    Case {
+        operator: "sweep-outwards",
+        scheme: "band three voxels wider, first order, against dilateSdf",
+        tolerance: 1.0,
+        contest: sweep_outwards,
     },
     Case {
         operator: "mesh-to-level-set",
@@ -146,6 +164,19 @@ fn exact_offset<'a>(input: &'a Input<'a>) -> Sides<'a> {
     )
 }
 
+fn morph<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let target = offset(input.level_set, input.level_set.voxel_size(), input.run)?;
+    let reference = ReferenceGrid::from_level_set(&target)?;
+    let run = input.run.clone();
+    let ours = move |grid: &mut LevelSet| {
+        morph_towards(grid, &target, None, Until::Time(1.0), &MorphOptions::OPENVDB, &run).map(drop)
+    };
+    let theirs = move |grid: &mut ReferenceGrid| {
+        grid.morph(&reference, 1.0, ReferenceScheme::HjWeno5, 2, &Tracker::default()).map(drop)
+    };
+    GridContest::new(input, Judge::Equal, Operation::in_place(ours), Operation::in_place(theirs))
+}
+
 fn csg_union<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let shifted = shifted(input.level_set)?;
     let reference = ReferenceGrid::from_level_set(&shifted)?;
@@ -164,6 +195,26 @@ fn exact_rebuild<'a>(input: &'a Input<'a>) -> Sides<'a> {
         Judge::Truth { offset: 0.0 },
         Operation::new(move |grid| rebuild(grid, &Rebuild::band(3.0), &run)),
         Operation::new(|grid: &ReferenceGrid| grid.rebuild(0.0, 3.0)),
+    )
+}
+
+fn sweep<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (half_width, run) = (input.level_set.half_width(), input.run.clone());
+    GridContest::new(
+        input,
+        Judge::Truth { offset: 0.0 },
+        Operation::new(move |grid| sweep_distance(grid, half_width, &run)),
+        Operation::new(|grid: &ReferenceGrid| grid.sweep(1)),
+    )
+}
+
+fn sweep_outwards<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (half_width, run) = (input.level_set.half_width() + 3.0, input.run.clone());
+    GridContest::new(
+        input,
+        Judge::Truth { offset: 0.0 },
+        Operation::new(move |grid| sweep_distance(grid, half_width, &run)),
+        Operation::new(|grid: &ReferenceGrid| grid.sweep_outwards(3, 1)),
     )
 }
 

@@ -117,8 +117,9 @@ impl Topology {
         self.merge_order(&added);
         if let Some(mut table) = self.neighbours.take() {
             table.resize(self.origins.len(), [LeafId::OUTSIDE; 27]);
+            let mut cache = NodeCache::default();
             for &(id, _) in &added {
-                let around = self.neighbours_of(id, &mut NodeCache::default());
+                let around = self.neighbours_of(id, &mut cache);
                 table[id.index()] = around;
                 relink(&mut table, &around, |_| id);
             }

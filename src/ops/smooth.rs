@@ -10,6 +10,7 @@
 //! Accuracy, measured on a sphere of 20 voxels over 60 steps: within 0.023 voxel of the exact radius in every direction
 //! with one HJ-WENO5 renormalisation a step (the default); first-order renormalisation errs by up to 0.17.
 
+use fearless_simd::Simd;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -17,11 +18,13 @@ use super::params::words;
 use super::registry::{Arity, Operator, Outcome, Summary};
 use super::solver::EvolutionOptions;
 use crate::error::Result;
-use crate::grid::LEAF_VOXELS;
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
 use crate::mesh::with_half_width;
-use crate::pde::{GradientNorm, LeafFields, Report, SolverOptions, SpeedFunction, UpwindScheme, WantedFields, evolve};
+use crate::pde::{Report, SolverOptions, SpeedFunction, UpwindScheme, evolve};
 use crate::run::RunOptions;
+use crate::stencil::curvature::{laplacian, mean_curvature};
+use crate::stencil::simd::Lanes;
+use crate::stencil::{FaceHalo, Halo};
 
 words! {
     /// How to smooth.
@@ -91,56 +94,43 @@ const NARROWEST_BAND: f32 = DEFAULT_HALF_WIDTH - 0.01;
 pub fn smooth(level_set: &mut LevelSet, params: &Smooth, run: &RunOptions) -> Result<Report> {
     params.validate()?;
     let region = params.evolution.region.parse()?;
-    let function: &dyn SpeedFunction = match params.method {
-        SmoothMethod::Curvature => &MeanCurvatureFlow,
-        SmoothMethod::Laplacian => &Diffusion,
-    };
-    evolve(level_set, function, region.as_deref(), params.evolution.until(), &params.evolution.solver(SOLVER), run)
+    let (region, until, solver) = (region.as_deref(), params.evolution.until(), params.evolution.solver(SOLVER));
+    match params.method {
+        SmoothMethod::Curvature => evolve(level_set, &MeanCurvatureFlow, region, until, &solver, run),
+        SmoothMethod::Laplacian => evolve(level_set, &Diffusion, region, until, &solver, run),
+    }
 }
 
 /// F = −H.
 struct MeanCurvatureFlow;
 
 impl SpeedFunction for MeanCurvatureFlow {
-    fn wants(&self) -> WantedFields {
-        WantedFields { mean_curvature: true, ..WantedFields::default() }
-    }
-
-    fn gradient_norm(&self) -> GradientNorm {
-        GradientNorm::Central
-    }
+    type Halo = Halo;
 
     fn largest_step(&self, voxel_size: f64) -> f64 {
         voxel_size * voxel_size / 3.0
     }
 
-    fn speed(&self, fields: &LeafFields, speed: &mut [f32; LEAF_VOXELS]) {
-        for (f, h) in speed.iter_mut().zip(&fields.mean_curvature) {
-            *f = -h;
-        }
+    #[inline(always)]
+    fn rate<S: Simd>(&self, simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
+        let at = mean_curvature(simd, halo, x, y, voxel_size);
+        -at.mean * at.gradient
     }
 }
 
-/// −φ_t = −Δφ.
+/// F|∇φ| = −Δφ.
 struct Diffusion;
 
 impl SpeedFunction for Diffusion {
-    fn wants(&self) -> WantedFields {
-        WantedFields { laplacian: true, ..WantedFields::default() }
-    }
-
-    fn gradient_norm(&self) -> GradientNorm {
-        GradientNorm::Unit
-    }
+    type Halo = FaceHalo;
 
     fn largest_step(&self, voxel_size: f64) -> f64 {
         voxel_size * voxel_size / 6.0
     }
 
-    fn speed(&self, fields: &LeafFields, speed: &mut [f32; LEAF_VOXELS]) {
-        for (f, l) in speed.iter_mut().zip(&fields.laplacian) {
-            *f = -l;
-        }
+    #[inline(always)]
+    fn rate<S: Simd>(&self, simd: S, halo: &FaceHalo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
+        -laplacian(simd, halo, x, y, voxel_size)
     }
 }
 

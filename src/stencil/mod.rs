@@ -5,8 +5,10 @@
 //! divided by the voxel size) unless the name says otherwise.
 
 pub mod curvature;
+pub mod eikonal;
 mod halo;
+pub mod normals;
 pub mod simd;
 pub mod upwind;
 
-pub use halo::{Halo, Row, StarHalo};
+pub use halo::{FaceHalo, Halo, LeafHalo, Row, StarHalo};
