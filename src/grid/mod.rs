@@ -164,8 +164,8 @@ impl Grid {
         &self.masks
     }
 
-    /// Origins of the absent leaves that face neighbours of the voxels of `seed` lie in, sorted. `seed` has the pages of this grid.
-    pub fn absent_beside(&self, seed: &Paged<LeafMask>) -> Vec<IVec3> {
+    /// Origins of the absent leaves that face neighbours of the voxels of `seed` lie in, sorted. `seed` is empty but in the leaves of `set`.
+    pub fn absent_beside(&self, seed: &Paged<LeafMask>, set: &LeafSet) -> Vec<IVec3> {
         let around = self.neighbours();
         let beside = |id: LeafId| {
             let around = &around[id.index()];
@@ -174,14 +174,13 @@ impl Grid {
                 absent.then(|| self.origin(id) + face.step() * LEAF_DIM)
             })
         };
-        let mut origins: Vec<IVec3> =
-            self.leaves().par_iter().with_min_len(PAGE_LEAVES).flat_map_iter(|&id| beside(id)).collect();
+        let mut origins: Vec<IVec3> = set.par_pages().flat_map_iter(|leaves| leaves.iter().flat_map(beside)).collect();
         origins.sort_unstable_by_key(|o| (o.x, o.y, o.z));
         origins.dedup();
         origins
     }
 
-    /// Activates the voxels of `seed` and their face neighbours, in the leaves of `set`.
+    /// Activates the voxels of `seed` and their face neighbours, in the leaves of `set`. `seed` has the pages of this grid.
     pub fn activate_beside(&mut self, seed: &Paged<LeafMask>, set: &LeafSet) {
         let around = self.topology.neighbours();
         self.masks.par_update(set, |id, mask| {

@@ -11,7 +11,7 @@ pub(super) struct Domain {
 
 struct Local {
     weights: RegionWeights,
-    /// Voxels that were active at the start and have weight 0.
+    /// Of the leaves worked on, the voxels that were active at the start and have weight 0.
     frozen: Paged<LeafMask>,
 }
 
@@ -24,8 +24,8 @@ impl Domain {
     /// The leaves that a region touches.
     pub fn region(grid: &Grid, weights: RegionWeights) -> Self {
         let mut frozen = Paged::filled(grid.value_pages().page_count(), LeafMask::EMPTY);
-        frozen.par_update(grid.leaf_set(), |id, frozen: &mut LeafMask| {
-            *frozen = grid.mask(id).zip(positive(&weights, id), |active, moves| active & !moves);
+        frozen.par_update(weights.leaves(), |id, frozen: &mut LeafMask| {
+            *frozen = grid.mask(id).zip(weights.positive(id), |active, moves| active & !moves);
         });
         Self { leaves: weights.leaves().clone(), local: Some(Local { weights, frozen }) }
     }
@@ -55,7 +55,7 @@ impl Domain {
     pub fn moving(&self, id: LeafId, active: LeafMask) -> LeafMask {
         match &self.local {
             None => active,
-            Some(local) => active.zip(positive(&local.weights, id), |a, moves| a & moves),
+            Some(local) => active.zip(local.weights.positive(id), |a, moves| a & moves),
         }
     }
 
@@ -68,13 +68,20 @@ impl Domain {
         }
     }
 
-    /// Takes leaves into the domain: new ones of the grid, or old ones that got new voxels.
-    pub fn include(&mut self, leaves: &[LeafId], pages: usize) {
-        for &id in leaves {
-            self.leaves.insert(id);
-        }
+    /// Takes in new leaves of a grid.
+    pub fn include_new(&mut self, grid: &Grid, leaves: &[LeafId]) {
+        leaves.iter().for_each(|&id| drop(self.leaves.insert(id)));
         if let Some(local) = &mut self.local {
-            local.frozen.grow(pages, LeafMask::EMPTY);
+            local.frozen.grow(grid.value_pages().page_count(), LeafMask::EMPTY);
+            leaves.iter().for_each(|&id| *local.frozen.get_mut(id) = LeafMask::EMPTY);
+        }
+    }
+
+    /// Takes in leaves of a grid that have not been worked on before: what is active in them was so at the start.
+    pub fn include_old(&mut self, grid: &Grid, leaves: &[LeafId]) {
+        leaves.iter().for_each(|&id| drop(self.leaves.insert(id)));
+        if let Some(local) = &mut self.local {
+            leaves.iter().for_each(|&id| *local.frozen.get_mut(id) = grid.mask(id));
         }
     }
 
@@ -84,14 +91,4 @@ impl Domain {
             self.leaves.remove(id);
         }
     }
-}
-
-/// Where the weight is above 0.
-#[inline(always)]
-fn positive(weights: &RegionWeights, id: LeafId) -> LeafMask {
-    if !weights.leaves().contains(id) {
-        return LeafMask::EMPTY;
-    }
-    let alpha = &weights.alpha(id).0;
-    LeafMask(std::array::from_fn(|x| (0..64).fold(0, |word, bit| word | u64::from(alpha[x * 64 + bit] > 0.0) << bit)))
 }
