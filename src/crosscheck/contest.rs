@@ -112,11 +112,9 @@ impl Contest for GridContest<'_> {
     }
 }
 
-/// A copy that shares no page with the original, as OpenVDB's deep copy.
+/// A copy that shares nothing with the original, as OpenVDB's deep copy.
 fn unshared(level_set: &LevelSet) -> LevelSet {
-    let mut copy = level_set.clone();
-    copy.grid_mut().update_all(|_, _, _| ());
-    copy
+    LevelSet::new(level_set.grid().deep_copy(), *level_set.transform())
 }
 
 /// The result of `f` and the milliseconds it took.

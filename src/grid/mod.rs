@@ -57,6 +57,14 @@ impl Grid {
         Self { background, topology: Arc::new(topology), values, masks }
     }
 
+    /// A copy that shares nothing with this grid.
+    pub fn deep_copy(&self) -> Self {
+        let mut copy = self.clone();
+        Arc::make_mut(&mut copy.topology);
+        copy.update_all(|_, _, _| ());
+        copy
+    }
+
     /// The value that stands for everything outside; its negative for everything inside.
     pub fn background(&self) -> f32 {
         self.background

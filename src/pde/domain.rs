@@ -1,7 +1,7 @@
 //! Which voxels a step may write: everything, or what a region touches.
 
-use crate::grid::{Grid, LeafId, LeafMask, LeafSet, Paged};
-use crate::region::RegionWeights;
+use crate::grid::{Grid, LeafId, LeafMask, LeafSet, Paged, Transform};
+use crate::region::{Region, RegionWeights};
 
 /// The leaves that a flow works on and, with a region, its weights and the voxels that must keep their bits.
 pub(super) struct Domain {
@@ -45,9 +45,11 @@ impl Domain {
         self.local.as_ref().map(|l| &l.weights)
     }
 
-    /// The weights, to be extended.
-    pub fn weights_mut(&mut self) -> Option<&mut RegionWeights> {
-        self.local.as_mut().map(|l| &mut l.weights)
+    /// Looks up the weights of voxels that became active.
+    pub fn weigh(&mut self, grid: &Grid, transform: &Transform, region: &dyn Region) {
+        if let Some(local) = &mut self.local {
+            local.weights.evaluate(grid, transform, region, &self.leaves);
+        }
     }
 
     /// Of the active voxels of a leaf, those that a flow moves: weight above 0.
@@ -72,7 +74,9 @@ impl Domain {
     pub fn include_new(&mut self, grid: &Grid, leaves: &[LeafId]) {
         leaves.iter().for_each(|&id| drop(self.leaves.insert(id)));
         if let Some(local) = &mut self.local {
-            local.frozen.grow(grid.value_pages().page_count(), LeafMask::EMPTY);
+            let pages = grid.value_pages().page_count();
+            local.frozen.grow(pages, LeafMask::EMPTY);
+            local.weights.grow(pages);
             leaves.iter().for_each(|&id| *local.frozen.get_mut(id) = LeafMask::EMPTY);
         }
     }
@@ -87,8 +91,9 @@ impl Domain {
 
     /// Forgets leaves that the grid lost.
     pub fn forget(&mut self, leaves: &[LeafId]) {
-        for &id in leaves {
-            self.leaves.remove(id);
+        leaves.iter().for_each(|&id| drop(self.leaves.remove(id)));
+        if let Some(local) = &mut self.local {
+            local.weights.forget(leaves);
         }
     }
 }

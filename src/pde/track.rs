@@ -33,12 +33,12 @@ impl Tracker<'_> {
             }
         }
         self.domain.include_new(self.grid, &added);
-        if let (Some(weights), Some(region)) = (self.domain.weights_mut(), self.region) {
-            weights.extend(self.grid, &self.transform, region, &added);
-        }
         // Asked again: slots of new leaves may have belonged to others before.
         let moving = self.moving();
         self.grid.activate_beside(&moving, self.domain.leaves());
+        if let Some(region) = self.region {
+            self.domain.weigh(self.grid, &self.transform, region);
+        }
     }
 
     /// After a trimming step: puts the second buffers in step with φ, and removes the leaves that were left empty. `emptied` is sorted by leaf.
