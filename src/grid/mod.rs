@@ -60,7 +60,7 @@ impl Grid {
     /// A copy that shares nothing with this grid.
     pub fn deep_copy(&self) -> Self {
         let mut copy = self.clone();
-        Arc::make_mut(&mut copy.topology);
+        Arc::make_mut(&mut copy.topology).unshare();
         copy.update_all(|_, _, _| ());
         copy
     }
@@ -238,12 +238,15 @@ impl Grid {
         let added = topology.insert(origins);
         self.values.grow_unwritten(topology.page_count());
         self.masks.grow(topology.page_count(), LeafMask::EMPTY);
-        for &(id, sentinel) in &added {
-            let value = if sentinel == LeafId::INSIDE { -self.background } else { self.background };
-            self.values.get_mut(id).0.fill(value);
-            *self.masks.get_mut(id) = LeafMask::EMPTY;
-        }
-        added.into_iter().map(|(id, _)| id).collect()
+        let inside: LeafSet =
+            added.iter().filter(|(_, sentinel)| *sentinel == LeafId::INSIDE).map(|(id, _)| *id).collect();
+        let added: Vec<LeafId> = added.into_iter().map(|(id, _)| id).collect();
+        let (set, background) = (added.iter().copied().collect(), self.background);
+        self.update(&set, |id, values, mask| {
+            values.0.fill(if inside.contains(id) { -background } else { background });
+            *mask = LeafMask::EMPTY;
+        });
+        added
     }
 
     /// Removes those of `candidates` that have no active voxel and one sign, which stays known.

@@ -72,7 +72,9 @@ impl Domain {
 
     /// Takes in new leaves of a grid.
     pub fn include_new(&mut self, grid: &Grid, leaves: &[LeafId]) {
-        leaves.iter().for_each(|&id| drop(self.leaves.insert(id)));
+        for &id in leaves {
+            self.leaves.insert(id);
+        }
         if let Some(local) = &mut self.local {
             let pages = grid.value_pages().page_count();
             local.frozen.grow(pages, LeafMask::EMPTY);
@@ -83,7 +85,9 @@ impl Domain {
 
     /// Takes in leaves of a grid that have not been worked on before: what is active in them was so at the start.
     pub fn include_old(&mut self, grid: &Grid, leaves: &[LeafId]) {
-        leaves.iter().for_each(|&id| drop(self.leaves.insert(id)));
+        for &id in leaves {
+            self.leaves.insert(id);
+        }
         if let Some(local) = &mut self.local {
             leaves.iter().for_each(|&id| *local.frozen.get_mut(id) = grid.mask(id));
         }
@@ -91,7 +95,9 @@ impl Domain {
 
     /// Forgets leaves that the grid lost.
     pub fn forget(&mut self, leaves: &[LeafId]) {
-        leaves.iter().for_each(|&id| drop(self.leaves.remove(id)));
+        for &id in leaves {
+            self.leaves.remove(id);
+        }
         if let Some(local) = &mut self.local {
             local.weights.forget(leaves);
         }

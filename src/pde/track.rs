@@ -26,11 +26,10 @@ impl Tracker<'_> {
         let reached = self.reached_leaves(&moving);
         self.domain.include_old(self.grid, &reached);
         let added = self.grid.add_leaves(&self.grid.absent_beside(&moving, self.domain.leaves()));
+        let (grid, new) = (&*self.grid, added.iter().copied().collect());
         for buffer in &mut self.buffers {
-            buffer.grow_unwritten(self.grid.value_pages().page_count());
-            for &id in &added {
-                buffer.get_mut(id).clone_from(self.grid.values(id));
-            }
+            buffer.grow_unwritten(grid.value_pages().page_count());
+            buffer.par_update(&new, |id, values| values.clone_from(grid.values(id)));
         }
         self.domain.include_new(self.grid, &added);
         // Asked again: slots of new leaves may have belonged to others before.
