@@ -175,6 +175,8 @@ public:
 
 std::unique_ptr<FloatGrid> copy_grid(const FloatGrid& grid);
 void filter_mean_curvature(FloatGrid& grid, std::size_t steps, const TrackerOptions& tracker);
+/// One step weighted by the values of `mask`, 0 to 1.
+void filter_mean_curvature_masked(FloatGrid& grid, const FloatGrid& mask, const TrackerOptions& tracker);
 void filter_laplacian(FloatGrid& grid, std::size_t steps, const TrackerOptions& tracker);
 void filter_gaussian(FloatGrid& grid, std::int32_t width, const TrackerOptions& tracker);
 void filter_mean(FloatGrid& grid, std::int32_t width, const TrackerOptions& tracker);

@@ -122,6 +122,11 @@ pub(super) mod ffi {
         fn quads(self: &RawMesh, out: &mut [u32]) -> Result<()>;
         fn copy_grid(grid: &FloatGrid) -> Result<UniquePtr<FloatGrid>>;
         fn filter_mean_curvature(grid: Pin<&mut FloatGrid>, steps: usize, tracker: &TrackerOptions) -> Result<()>;
+        fn filter_mean_curvature_masked(
+            grid: Pin<&mut FloatGrid>,
+            mask: &FloatGrid,
+            tracker: &TrackerOptions,
+        ) -> Result<()>;
         fn filter_laplacian(grid: Pin<&mut FloatGrid>, steps: usize, tracker: &TrackerOptions) -> Result<()>;
         fn filter_gaussian(grid: Pin<&mut FloatGrid>, width: i32, tracker: &TrackerOptions) -> Result<()>;
         fn filter_mean(grid: Pin<&mut FloatGrid>, width: i32, tracker: &TrackerOptions) -> Result<()>;

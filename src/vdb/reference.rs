@@ -169,6 +169,11 @@ impl ReferenceGrid {
         Ok(Self { grid, transform: self.transform })
     }
 
+    /// One step of mean curvature flow, weighted by the values of `mask` (0 to 1, as active voxels of a grid).
+    pub fn mean_curvature_masked(&mut self, mask: &Self, tracker: &Tracker) -> Result<()> {
+        ffi::filter_mean_curvature_masked(self.grid.pin_mut(), &mask.grid, &tracker.raw()).map_err(failed)
+    }
+
     /// A constructive operation into a new grid. Both must have the same transform.
     pub fn csg(&self, other: &Self, operation: Csg) -> Result<Self> {
         let grid = match operation {
