@@ -26,6 +26,8 @@ pub enum StopReason {
     Time,
     /// The surface vanished, or the region touches nothing.
     NothingLeft,
+    /// The speed is 0 everywhere.
+    AtRest,
 }
 
 /// What a flow did.
@@ -44,6 +46,65 @@ pub struct Report {
 /// Most steps of one flow: a time that needs more was meant otherwise.
 const MOST_STEPS: f64 = 1e6;
 
+/// Part of a step by which a time may exceed a whole number of steps without one more: rounding of its sums.
+const WHOLE_STEPS: f64 = 1e-9;
+
+/// What the time loop drives.
+pub(super) trait Motion {
+    /// Looks at the field before a step and returns the largest stable time step, or `None` if nothing moves any more.
+    fn prepare(&mut self, tracker: &Tracker) -> Option<f64>;
+
+    /// Moves the surface by a time step, up to the one that `prepare` allowed.
+    fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()>;
+}
+
+/// The time loop: steps and tracks until it is time to stop. Steps are equal parts of the time that remains.
+pub(super) fn drive(tracker: &mut Tracker, motion: &mut impl Motion, until: Until) -> Result<Report> {
+    let (most, end) = match until {
+        Until::Iterations(n) => (n, f64::INFINITY),
+        Until::Time(t) if t >= 0.0 && t.is_finite() => (u32::MAX, t),
+        Until::Time(t) => return Err(EditError::parameter("evolve", "time", t, "0 or more")),
+    };
+    let run = tracker.run;
+    let mut task = None;
+    let mut report = Report {
+        steps: 0,
+        time: 0.0,
+        voxels: tracker.moving_voxels(),
+        stopped: if end.is_finite() { StopReason::Time } else { StopReason::Iterations },
+    };
+    while report.steps < most && report.time < end {
+        if report.voxels == 0 {
+            report.stopped = StopReason::NothingLeft;
+            break;
+        }
+        let Some(largest) = motion.prepare(tracker) else {
+            report.stopped = StopReason::AtRest;
+            break;
+        };
+        let (dt, steps_left) = if end.is_finite() {
+            let left = (end - report.time) / largest;
+            if left + f64::from(report.steps) > MOST_STEPS {
+                let accepted = format!("0 to {} at this voxel size", largest * MOST_STEPS);
+                return Err(EditError::parameter("evolve", "time", end, accepted));
+            }
+            let steps = (left - WHOLE_STEPS).ceil().max(1.0);
+            ((end - report.time) / steps, steps as u32)
+        } else {
+            (largest, most - report.steps)
+        };
+        let task = task.get_or_insert_with(|| run.task("evolving", u64::from(steps_left)));
+        motion.step(tracker, dt)?;
+        tracker.track()?;
+        report.steps += 1;
+        // Not the sum of the steps, which rounding may leave short of the end.
+        report.time = if end.is_finite() && steps_left == 1 { end } else { report.time + dt };
+        report.voxels = tracker.moving_voxels();
+        task.advance(1);
+    }
+    Ok(report)
+}
+
 /// Moves a surface by φ_t = −F|∇φ|, everywhere or weighted by a region, tracking the band after each step.
 pub fn evolve(
     level_set: &mut LevelSet,
@@ -53,44 +114,25 @@ pub fn evolve(
     solver: &SolverOptions,
     run: &RunOptions,
 ) -> Result<Report> {
-    let largest = function.largest_step(level_set.voxel_size());
-    let (steps, dt) = match until {
-        Until::Iterations(n) => (n, largest),
-        Until::Time(t) => {
-            if !(t >= 0.0 && t / largest <= MOST_STEPS) {
-                return Err(EditError::parameter(
-                    "evolve",
-                    "time",
-                    t,
-                    format!("0 to {} at this voxel size", largest * MOST_STEPS),
-                ));
-            }
-            let steps = (t / largest).ceil();
-            (steps as u32, if steps > 0.0 { t / steps } else { 0.0 })
-        }
-    };
-    let voxel_size = level_set.voxel_size() as f32;
+    let voxel_size = level_set.voxel_size();
     let mut tracker = Tracker::new(level_set, region, *solver, run);
-    let task = run.task("evolving", u64::from(steps));
-    let step = FlowStep { function, dt: dt as f32, voxel_size };
-    let mut report = Report {
-        steps: 0,
-        time: 0.0,
-        voxels: tracker.moving_voxels(),
-        stopped: if matches!(until, Until::Time(_)) { StopReason::Time } else { StopReason::Iterations },
-    };
-    for n in 0..steps {
-        if report.voxels == 0 {
-            report.stopped = StopReason::NothingLeft;
-            break;
-        }
-        // Flows of curvature are first order in time: dt is bounded by stability, not by accuracy.
-        tracker.integrate(&step, TimeIntegrator::TvdRk1, Target::Moving)?;
-        tracker.track()?;
-        report.steps = n + 1;
-        report.time = f64::from(report.steps) * dt;
-        report.voxels = tracker.moving_voxels();
-        task.advance(1);
+    drive(&mut tracker, &mut Flow { function, voxel_size }, until)
+}
+
+/// The motion that a speed function describes.
+struct Flow<'a> {
+    function: &'a dyn SpeedFunction,
+    voxel_size: f64,
+}
+
+impl Motion for Flow<'_> {
+    fn prepare(&mut self, _: &Tracker) -> Option<f64> {
+        Some(self.function.largest_step(self.voxel_size))
     }
-    Ok(report)
+
+    fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
+        let step = FlowStep { function: self.function, dt: dt as f32, voxel_size: self.voxel_size as f32 };
+        // Flows of curvature are first order in time: dt is bounded by stability, not by accuracy.
+        tracker.integrate(&step, TimeIntegrator::TvdRk1, Target::Moving)
+    }
 }
