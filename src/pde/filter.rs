@@ -61,13 +61,15 @@ pub fn filter(
 ) -> Result<Report> {
     filter.validate("filter")?;
     let mut tracker = Tracker::new(level_set, region, *solver, run);
+    let mut motion = filter;
     let rounds = if filter.kind == FilterKind::Gaussian { 4 } else { 1 };
-    let report = drive(&mut tracker, &mut { filter }, Until::Iterations(applications.saturating_mul(rounds)))?;
+    let report = drive(&mut tracker, &mut motion, Until::Iterations(applications.saturating_mul(rounds)))?;
     Ok(Report { steps: report.steps.div_ceil(rounds), time: 0.0, ..report })
 }
 
 impl Motion for Filter {
     fn prepare(&mut self, _: &Tracker) -> Option<f64> {
+        // A filter knows no time.
         Some(1.0)
     }
 
@@ -104,13 +106,17 @@ pub fn offset(
     }
     let length = distance.abs() as f32;
     let mut shift = Shift { length, largest, done: 0.0, sign: 1f32.copysign(distance as f32) };
-    let steps = (f64::from(length) / f64::from(largest)).ceil() as u32;
+    // Negative becomes 0.
+    let steps = (f64::from(length) / f64::from(largest) - ROUNDING).ceil() as u32;
     let report = drive(&mut tracker, &mut shift, Until::Iterations(steps))?;
     Ok(Report { time: 0.0, ..report })
 }
 
 /// Most steps of an offset: a distance that needs more was meant otherwise.
 const MOST_STEPS: f64 = 1e5;
+
+/// Part of a step that is not worth one.
+const ROUNDING: f64 = 0.001;
 
 /// A motion by a length.
 struct Shift {
@@ -123,8 +129,7 @@ struct Shift {
 impl Motion for Shift {
     fn prepare(&mut self, _: &Tracker) -> Option<f64> {
         let left = self.length - self.done;
-        // Less is rounding.
-        (left > 0.001 * self.largest).then_some(f64::from(left.min(self.largest)))
+        (left > ROUNDING as f32 * self.largest).then_some(f64::from(left.min(self.largest)))
     }
 
     fn step(&mut self, tracker: &mut Tracker, step: f64) -> Result<()> {
