@@ -88,7 +88,7 @@ impl Motion for Filter {
 /// Moves the surface by `distance` (world units, positive outwards) in steps of at most half a voxel, φ ← φ − d, tracking the band
 /// after each; everywhere or weighted by a region.
 ///
-/// Every step relies on |∇φ| = 1, and each renormalisation errs a little: [`offset`](crate::ops::morphology::offset) is exact.
+/// Every step relies on |∇φ| = 1, and each renormalisation errs a little; the offset of `ops::morphology` is exact.
 /// This is OpenVDB's `LevelSetFilter::offset` with the sign turned, and rounds as that does.
 pub fn offset(
     level_set: &mut LevelSet,
@@ -100,7 +100,7 @@ pub fn offset(
     let mut tracker = Tracker::new(level_set, region, *solver, run);
     let largest = 0.5 * tracker.voxel_size();
     let most = f64::from(largest) * MOST_STEPS;
-    if !(distance.abs() <= most) {
+    if !distance.is_finite() || distance.abs() > most {
         let accepted = format!("a length of at most {most} at this voxel size");
         return Err(EditError::parameter("offset", "distance", distance, accepted));
     }

@@ -284,7 +284,7 @@ mod tests {
             for at in grid.mask(id).iter().filter(|at| at / 64 % 3 == 1 && (2..5).contains(&(at / 8 % 8))) {
                 part.set(at, true);
             }
-            for voxels in [*grid.mask(id), part] {
+            for voxels in [grid.mask(id), part] {
                 let mut cube = Cube::new(width);
                 cube.gather(grid.value_pages(), &grid.neighbours()[id.index()], voxels);
                 let (mut mean, mut median) = (LeafValues::default(), LeafValues::default());
@@ -318,8 +318,9 @@ mod tests {
                 // How many zeros each column has: no more than the column before it along either axis.
                 for code in 0..4usize.pow(9) {
                     let zeros: [usize; 9] = std::array::from_fn(|c| code >> (2 * c) & 3);
-                    let falls =
-                        |c: usize| (c < 3 || zeros[c - 3] >= zeros[c]) && (c % 3 == 0 || zeros[c - 1] >= zeros[c]);
+                    let falls = |c: usize| {
+                        (c < 3 || zeros[c - 3] >= zeros[c]) && (c.is_multiple_of(3) || zeros[c - 1] >= zeros[c])
+                    };
                     if !(0..9).all(falls) {
                         continue;
                     }
