@@ -12,7 +12,9 @@ use crate::ops::csg::{CsgOperation, csg};
 use crate::ops::morphology::offset;
 use crate::ops::smooth::{Smooth, SmoothMethod, smooth};
 use crate::ops::{EvolutionOptions, Like, RegionSpecs, Scheme};
-use crate::pde::{MorphOptions, SolverOptions, Until, UpwindScheme, WenoEpsilon, morph_towards, renormalize, track};
+use crate::pde::{
+    self, MorphOptions, SolverOptions, Until, UpwindScheme, WenoEpsilon, morph_towards, renormalize, track,
+};
 use crate::region::Primitive;
 use crate::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceScheme, Tracker};
 
@@ -29,6 +31,8 @@ pub(super) struct Case {
 }
 
 const FIRST_STEP: &str = "one step and track, first order, RK1, 1";
+
+const FILTER: &str = "width 1, HJ-WENO5, RK1, 3";
 
 /// All rows, in order.
 pub(super) const CASES: &[Case] = &[
@@ -49,12 +53,16 @@ pub(super) const CASES: &[Case] = &[
     Case { operator: "normalize-first", scheme: "first order, RK1, 1", tolerance: 1e-5, contest: normalize_first },
     Case { operator: "normalize-weno5", scheme: "HJ-WENO5, RK1, 1", tolerance: 1e-5, contest: normalize_weno5 },
     Case { operator: "track", scheme: "HJ-WENO5, RK1, 3", tolerance: 1e-5, contest: whole_track },
+    Case { operator: "offset-pde", scheme: "one voxel, HJ-WENO5, RK1, 3", tolerance: 1e-4, contest: offset_by_flow },
     Case {
         operator: "offset",
         scheme: "one voxel: exact, against HJ-WENO5, RK1, 3",
         tolerance: 0.05,
         contest: exact_offset,
     },
+    Case { operator: "gaussian", scheme: FILTER, tolerance: 1e-4, contest: gaussian },
+    Case { operator: "mean", scheme: FILTER, tolerance: 1e-4, contest: mean },
+    Case { operator: "median", scheme: FILTER, tolerance: 1e-4, contest: median },
     Case {
         operator: "morph",
         scheme: "towards a copy one voxel larger, time 1, HJ-WENO5, RK2; track HJ-WENO5, RK1, 3",
@@ -109,7 +117,7 @@ fn same<'a>(
     GridContest::new(input, Judge::Equal, Operation::in_place(ours), theirs)
 }
 
-/// One step of a smoothing flow.
+/// One step of a smoothing flow, or one application of a filter.
 fn flow<'a>(
     input: &'a Input<'a>,
     method: SmoothMethod,
@@ -118,7 +126,7 @@ fn flow<'a>(
     tracker: Tracker,
 ) -> Sides<'a> {
     let evolution = EvolutionOptions { iterations: Some(1), ..evolution };
-    let (params, run) = (Smooth { method, evolution }, input.run.clone());
+    let (params, run) = (Smooth { method, evolution, ..Smooth::default() }, input.run.clone());
     same(input, move |grid| smooth(grid, &params, &run).map(drop), filter, tracker)
 }
 
@@ -173,9 +181,34 @@ fn laplacian<'a>(input: &'a Input<'a>) -> Sides<'a> {
     flow(input, SmoothMethod::Laplacian, first_order(), Filter::Laplacian(1), FIRST)
 }
 
+fn like_openvdb() -> EvolutionOptions {
+    EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() }
+}
+
 fn mean_curvature_default<'a>(input: &'a Input<'a>) -> Sides<'a> {
-    let like = EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() };
-    flow(input, SmoothMethod::Curvature, like, Filter::MeanCurvature(1), Tracker::default())
+    flow(input, SmoothMethod::Curvature, like_openvdb(), Filter::MeanCurvature(1), Tracker::default())
+}
+
+fn gaussian<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Gaussian, like_openvdb(), Filter::Gaussian(1), Tracker::default())
+}
+
+fn mean<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Mean, like_openvdb(), Filter::Mean(1), Tracker::default())
+}
+
+fn median<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Median, like_openvdb(), Filter::Median(1), Tracker::default())
+}
+
+fn offset_by_flow<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (voxel, run) = (input.level_set.voxel_size(), input.run.clone());
+    same(
+        input,
+        move |grid| pde::offset(grid, voxel, None, &SolverOptions::OPENVDB, &run).map(drop),
+        Filter::Offset(voxel as f32),
+        Tracker::default(),
+    )
 }
 
 fn normalize_first<'a>(input: &'a Input<'a>) -> Sides<'a> {
