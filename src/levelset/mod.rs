@@ -6,6 +6,7 @@
 mod build;
 mod check;
 mod components;
+mod curve;
 pub(crate) mod dual;
 pub(crate) mod isosurface;
 mod lattice;

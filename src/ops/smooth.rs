@@ -90,7 +90,7 @@ const NARROWEST_BAND: f32 = DEFAULT_HALF_WIDTH - 0.01;
 /// Smooths in place. The band should be at least 3 voxels wide to each side.
 pub fn smooth(level_set: &mut LevelSet, params: &Smooth, run: &RunOptions) -> Result<Report> {
     params.validate()?;
-    let region = params.evolution.region.parse()?;
+    let region = params.evolution.region.on(level_set, run)?;
     let function: &dyn SpeedFunction = match params.method {
         SmoothMethod::Curvature => &MeanCurvatureFlow,
         SmoothMethod::Laplacian => &Diffusion,
@@ -225,7 +225,7 @@ mod tests {
         let params = Smooth { evolution, ..Default::default() };
         let mut after = before.clone();
         smooth(&mut after, &params, &RunOptions::default()).unwrap();
-        let weight = params.evolution.region.parse().unwrap().unwrap();
+        let weight = params.evolution.region.on(&before, &RunOptions::default()).unwrap().unwrap();
         let (mut frozen, mut moved) = (0, 0);
         for &id in before.grid().leaves() {
             for offset in before.grid().mask(id).iter() {

@@ -3,14 +3,19 @@
 //! An operator's result is (1 − α)·old + α·new. Where α = 0, every voxel that was active keeps its bits. Regions are
 //! feathered by default, so that the result stays a distance at the region's rim.
 
+mod field;
+mod files;
+mod near;
+mod plan;
 mod primitive;
-mod spec;
 mod weights;
 
 use glam::DVec3;
 
-pub use primitive::{Primitive, Shape};
-pub use spec::parse_regions;
+pub use field::{Inside, Painted, Part};
+pub use near::Near;
+pub use plan::RegionPlan;
+pub use primitive::{HalfSpace, Primitive, Shape};
 pub use weights::RegionWeights;
 
 /// A weight in space.
@@ -20,6 +25,11 @@ pub trait Region: Send + Sync {
 
     /// World-space box outside which α is 0; `None` if there is none.
     fn bounds(&self) -> Option<(DVec3, DVec3)>;
+
+    /// Whether α can be above 0 within `radius` of `centre`: leaves for which it cannot are not looked at.
+    fn touches(&self, centre: DVec3, radius: f64) -> bool {
+        self.bounds().is_none_or(|(lo, hi)| (centre + radius).cmpge(lo).all() && (centre - radius).cmple(hi).all())
+    }
 }
 
 /// Museth's C¹ ramp P: 0 below 0, 2β² up to ½, 1 − 2(β − 1)² up to 1, then 1.
@@ -70,6 +80,14 @@ impl Region for Combined {
                 .reduce(|a, b| a.zip(b).map(|(a, b)| (a.0.min(b.0), a.1.max(b.1))))
                 .flatten(),
             Self::Not(_) => None,
+        }
+    }
+
+    fn touches(&self, centre: DVec3, radius: f64) -> bool {
+        match self {
+            Self::All(parts) => parts.iter().all(|p| p.touches(centre, radius)),
+            Self::Any(parts) => parts.iter().any(|p| p.touches(centre, radius)),
+            Self::Not(_) => true,
         }
     }
 }

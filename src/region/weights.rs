@@ -24,15 +24,13 @@ impl RegionWeights {
     /// Evaluates `region` on leaves that are new in the grid.
     pub fn extend(&mut self, grid: &Grid, transform: &Transform, region: &dyn Region, leaves: &[LeafId]) {
         self.alpha.grow(grid.value_pages().page_count(), LeafValues::default());
-        let bounds = region.bounds();
         let touched: LeafSet = leaves
             .iter()
             .copied()
             .filter(|&id| {
-                // The sphere around the leaf against the region's box.
                 let centre = transform.index_to_world(grid.origin(id).as_dvec3() + (f64::from(LEAF_DIM) - 1.0) / 2.0);
                 let reach = (f64::from(LEAF_DIM) - 1.0) / 2.0 * 3f64.sqrt() * transform.voxel_size();
-                bounds.is_none_or(|(lo, hi)| (centre + reach).cmpge(lo).all() && (centre - reach).cmple(hi).all())
+                region.touches(centre, reach)
             })
             .collect();
         self.alpha.par_update(&touched, |id, alpha| {
