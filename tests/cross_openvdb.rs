@@ -153,7 +153,7 @@ fn csg_is_the_same_to_the_last_bit() {
             (CsgOperation::Intersection, Csg::Intersection),
             (CsgOperation::Difference, Csg::Difference),
         ] {
-            let result = csg(&a, &b, ours);
+            let result = csg(&a, &[&b], ours, &RunOptions::default()).unwrap();
             let reference = ra.csg(&rb, theirs).unwrap().to_level_set().unwrap();
             assert_same(&format!("{name} {ours:?}"), &result, &reference, 0.0);
             // Signs away from the band as well.

@@ -173,7 +173,7 @@ fn cases(level_set: &LevelSet, mesh: &TriangleMesh, run: &RunOptions) -> Result<
         (mesh.positions.iter().map(|p| p.as_vec3()).collect(), mesh.triangles.clone());
     let (plain, params) = (mesh.clone(), MeshToLevelSet { half_width, ..MeshToLevelSet::new(voxel_size) });
     let run_of = || run.clone();
-    let [offset_run, rebuild_run, mesh_run] = [run_of(), run_of(), run_of()];
+    let [offset_run, csg_run, rebuild_run, mesh_run] = [run_of(), run_of(), run_of(), run_of()];
     Ok(vec![
         flow(
             "mean-curvature",
@@ -215,7 +215,7 @@ fn cases(level_set: &LevelSet, mesh: &TriangleMesh, run: &RunOptions) -> Result<
             scheme: "with a copy shifted by half its size, against csgUnionCopy",
             tolerance: 0.0,
             judge: Judge::Equal,
-            ours: Box::new(move |grid| replace(grid, |g| Ok(csg(g, &shifted, CsgOperation::Union)))),
+            ours: Box::new(move |grid| replace(grid, |g| csg(g, &[&shifted], CsgOperation::Union, &csg_run))),
             theirs: Box::new(move |grid| replace(grid, |g| g.csg(&shifted_reference, Csg::Union))),
         },
         Case {
