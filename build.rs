@@ -42,7 +42,7 @@ mod bridge {
                 found.configure(&mut build).include(generated).opt_level(3).file("cpp/reference.cc");
                 build.cargo_metadata(false).compile("vdb_edit_reference");
             });
-            found.configure(&mut bridge).opt_level(3).files(["cpp/archive.cc", "cpp/grid.cc"]);
+            found.configure(&mut bridge).opt_level(3).files(["cpp/archive.cc", "cpp/grid.cc", "cpp/reference_io.cc"]);
             bridge.cargo_metadata(false).compile("vdb_edit_bridge");
             reference.join().map_err(|_| "the compiler failed on cpp/reference.cc, see above".to_string())
         })?;

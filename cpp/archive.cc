@@ -11,7 +11,9 @@
 #include <openvdb/io/GridDescriptor.h>
 #include <openvdb/io/io.h>
 
+#include <tbb/blocked_range.h>
 #include <tbb/global_control.h>
+#include <tbb/parallel_for.h>
 
 #include <algorithm>
 #include <array>
@@ -341,6 +343,8 @@ std::unique_ptr<Archive> read_bytes(rust::Slice<const std::uint8_t> bytes, bool 
     return read_stream(memory, headers_only);
 }
 
+void release_voxels(Archive& archive, std::size_t index) { archive.impl->entries.at(index).grid->newTree(); }
+
 ArchiveHeader Archive::header() const
 {
     ArchiveHeader out{impl->file_version, impl->library.first, impl->library.second, rust::String::lossy(impl->uuid),
@@ -390,7 +394,40 @@ std::unique_ptr<Leaves> archive_leaves(const Archive& archive, std::size_t index
 
 namespace {
 
-/// Takes in bytes and keeps 128 bits that depend on all of them and their order.
+/// 128 bits that depend on all bytes taken in and their order.
+class Lanes {
+public:
+    /// Takes in `n` bytes, a multiple of 32.
+    void absorb(const char* bytes, std::size_t n)
+    {
+        for (std::size_t at = 0; at < n; at += 32) {
+            std::array<std::uint64_t, 4> words;
+            std::memcpy(words.data(), bytes + at, 32);
+            for (std::size_t lane = 0; lane < 4; ++lane) lanes_[lane] = mix(lanes_[lane] + words[lane]) + lane;
+        }
+    }
+
+    std::array<std::uint64_t, 2> digest(std::uint64_t salt) const
+    {
+        std::uint64_t low = salt, high = ~salt;
+        for (const std::uint64_t lane : lanes_) {
+            low = mix(low ^ lane);
+            high = mix(high + lane);
+        }
+        return {low, high};
+    }
+
+private:
+    static std::uint64_t mix(std::uint64_t x)
+    {
+        x = (x ^ (x >> 32)) * 0x9fb21c651e98df25;
+        return x ^ (x >> 28);
+    }
+
+    std::array<std::uint64_t, 4> lanes_{1, 2, 3, 4};
+};
+
+/// Hashes what is written to it.
 class HashBuffer final : public std::streambuf {
 public:
     HashBuffer() { setp(block_.data(), block_.data() + block_.size()); }
@@ -398,11 +435,7 @@ public:
     std::string digest()
     {
         absorb();
-        std::uint64_t low = length_, high = ~length_;
-        for (const std::uint64_t lane : lanes_) {
-            low = mix(low ^ lane);
-            high = mix(high + lane);
-        }
+        const auto [low, high] = lanes_.digest(length_);
         std::ostringstream text;
         text << std::hex << high << '-' << low;
         return text.str();
@@ -424,34 +457,40 @@ protected:
     }
 
 private:
-    static std::uint64_t mix(std::uint64_t x)
-    {
-        x = (x ^ (x >> 32)) * 0x9fb21c651e98df25;
-        return x ^ (x >> 28);
-    }
-
     void absorb()
     {
         const std::size_t n = static_cast<std::size_t>(pptr() - pbase());
         // The rest of the last word is zero; the length tells blocks apart that differ only there.
         const std::size_t padded = (n + 31) / 32 * 32;
         std::memset(block_.data() + n, 0, padded - n);
-        for (std::size_t at = 0; at < padded; at += 32) {
-            std::array<std::uint64_t, 4> words;
-            std::memcpy(words.data(), block_.data() + at, 32);
-            for (std::size_t lane = 0; lane < 4; ++lane) lanes_[lane] = mix(lanes_[lane] + words[lane]) + lane;
-        }
+        lanes_.absorb(block_.data(), padded);
         length_ += n;
         setp(block_.data(), block_.data() + block_.size());
     }
 
     std::array<char, 1 << 15> block_;
-    std::array<std::uint64_t, 4> lanes_{1, 2, 3, 4};
+    Lanes lanes_;
     std::uint64_t length_ = 0;
 };
 
+/// A hash of the values of each leaf, in the tree's order.
+std::vector<std::array<std::uint64_t, 2>> leaf_hashes(const openvdb::FloatTree& tree)
+{
+    std::vector<const LeafNode*> leaves;
+    tree.getNodes(leaves);
+    std::vector<std::array<std::uint64_t, 2>> hashes(leaves.size());
+    tbb::parallel_for(tbb::blocked_range<std::size_t>(0, leaves.size(), 64), [&](const auto& range) {
+        for (std::size_t i = range.begin(); i != range.end(); ++i) {
+            Lanes lanes;
+            lanes.absorb(reinterpret_cast<const char*>(leaves[i]->buffer().data()), LeafNode::SIZE * sizeof(float));
+            hashes[i] = lanes.digest(i);
+        }
+    });
+    return hashes;
+}
+
 /// The tree as OpenVDB would store it without compression: works for every grid type, and grids stored as half compare
-/// as rounded.
+/// as rounded. The values of float grids, which are most of it, are hashed leaf by leaf in parallel.
 std::string fingerprint(const openvdb::GridBase& grid)
 {
     vio::StreamMetadata::Ptr tag(new vio::StreamMetadata);
@@ -459,7 +498,13 @@ std::string fingerprint(const openvdb::GridBase& grid)
     std::ostream stream(&hash);
     vio::setStreamMetadataPtr(stream, tag, /*transfer=*/false);
     grid.writeTopology(stream);
-    grid.writeBuffers(stream);
+    const auto* floats = grid.saveFloatAsHalf() ? nullptr : dynamic_cast<const openvdb::FloatGrid*>(&grid);
+    if (floats) {
+        const auto hashes = leaf_hashes(floats->tree());
+        stream.write(reinterpret_cast<const char*>(hashes.data()), static_cast<std::streamsize>(hashes.size() * sizeof(hashes[0])));
+    } else {
+        grid.writeBuffers(stream);
+    }
     return hash.digest();
 }
 

@@ -4,6 +4,8 @@ use glam::Vec3;
 
 use super::Input;
 use super::contest::{Contest, GridContest, Judge, Operation};
+use super::files::{Reading, Writing};
+use super::polygons::Polygonising;
 use crate::error::{EditError, Result};
 use crate::grid::Transform;
 use crate::levelset::LevelSet;
@@ -65,6 +67,19 @@ pub(super) const CASES: &[Case] = &[
         scheme: "half width of the input, closed",
         tolerance: 1e-3,
         contest: from_mesh,
+    },
+    Case {
+        operator: "level-set-to-mesh",
+        scheme: "against volumeToMesh, adaptivity 0; distance of its vertices",
+        tolerance: 1.0,
+        contest: |input| Polygonising::new(input),
+    },
+    Case { operator: "read", scheme: "blosc, float", tolerance: 0.0, contest: |input| Reading::new(input) },
+    Case {
+        operator: "write",
+        scheme: "blosc, float; ours flushed and verified",
+        tolerance: 0.0,
+        contest: |input| Writing::new(input),
     },
 ];
 

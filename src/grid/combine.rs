@@ -6,6 +6,7 @@
 //! result holds at most twice the memory of its leaves.
 
 use glam::IVec3;
+use rayon::prelude::*;
 use smallvec::SmallVec;
 
 use super::topology::{Cursor, Topology, key};
@@ -66,7 +67,7 @@ impl<'a> Combination<'a> {
             _ => None,
         };
         let mut survivors: Vec<Vec<u32>> = parts.iter().map(|p| vec![0; p.topology.page_count()]).collect();
-        for (part, id) in places.iter().filter_map(as_it_is) {
+        for (part, id) in places.iter().flatten().filter_map(as_it_is) {
             survivors[part][id.page()] += 1;
         }
         // The page of the new grid that a page of a part becomes; 0, the page of the sentinels, where it is not shared.
@@ -84,6 +85,7 @@ impl<'a> Combination<'a> {
         let mut made = Vec::new();
         let leaves = places
             .into_iter()
+            .flatten()
             .map(|place| {
                 let page = as_it_is(&place).map_or(0, |(part, id)| survivors[part][id.page()] as usize);
                 let id = match as_it_is(&place) {
@@ -141,9 +143,23 @@ impl<'a> Combination<'a> {
     }
 }
 
-/// Where the result has leaves, in the order of origins.
-fn places(parts: &[&Grid], rule: SignRule) -> Vec<Place> {
-    let mut cursors: Vec<Cursor> = parts.iter().map(|part| Cursor::new(&part.topology)).collect();
+/// Leaves of the largest part that one task walks over.
+const TASK_LEAVES: usize = 2048;
+
+/// Where the result has leaves, in the order of origins: lists to be read one after the other.
+fn places(parts: &[&Grid], rule: SignRule) -> Vec<Vec<Place>> {
+    let largest = parts.iter().max_by_key(|part| part.leaves().len());
+    let mut cuts: Vec<i32> = largest
+        .map(|part| part.leaves().iter().skip(TASK_LEAVES).step_by(TASK_LEAVES).map(|id| part.origin(*id).x).collect())
+        .unwrap_or_default();
+    cuts.dedup();
+    let slabs: Vec<(i32, i32)> =
+        std::iter::once(i32::MIN).chain(cuts.iter().copied()).zip(cuts.iter().copied().chain([i32::MAX])).collect();
+    slabs.into_par_iter().map(|(from, to)| places_between(parts, rule, from, to)).collect()
+}
+
+fn places_between(parts: &[&Grid], rule: SignRule, from: i32, to: i32) -> Vec<Place> {
+    let mut cursors: Vec<Cursor> = parts.iter().map(|part| Cursor::new(&part.topology, from, to)).collect();
     let mut places = Vec::new();
     while let Some(origin) = cursors.iter().filter_map(Cursor::origin).min_by_key(|o| key(*o)) {
         let mut sources = Sources::new();

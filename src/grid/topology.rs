@@ -80,7 +80,7 @@ impl Topology {
         let mut nodes: Vec<IVec3> = parts.iter().flat_map(|part| part.nodes.keys().copied()).collect();
         nodes.sort_unstable_by_key(|n| key(*n));
         nodes.dedup();
-        let mut tables: Vec<Box<NodeTable>> = nodes.par_iter().map(|node| combined_signs(parts, rule, *node)).collect();
+        let mut tables: Vec<Arc<NodeTable>> = nodes.par_iter().map(|node| combined_signs(parts, rule, *node)).collect();
         let places: FxHashMap<IVec3, usize> = nodes.iter().copied().zip(0..).collect();
         let mut topology = Self { origins: vec![IVec3::ZERO; slots], ..Self::default() };
         // Leaves come in runs of one node.
@@ -93,16 +93,15 @@ impl Topology {
             };
             last = place.map(|place| (node, place));
             if let Some(table) = place.and_then(|place| tables.get_mut(place)) {
-                table[entry_of(origin)] = id;
+                Arc::make_mut(table)[entry_of(origin)] = id;
             }
             topology.origins[id.index()] = origin;
         }
         topology.order = leaves.iter().map(|(_, id)| *id).collect();
         topology.live = topology.order.iter().copied().collect();
-        topology.free =
-            (PAGE_LEAVES..slots).rev().map(LeafId::new).filter(|id| !topology.live.contains(*id)).collect();
+        topology.free = (PAGE_LEAVES..slots).rev().map(LeafId::new).filter(|id| !topology.live.contains(*id)).collect();
         let known = nodes.into_iter().zip(tables).filter(|(_, table)| table.iter().any(|e| *e != LeafId::OUTSIDE));
-        topology.nodes = known.map(|(node, table)| (node, table.into())).collect();
+        topology.nodes = known.collect();
         topology
     }
 
@@ -356,8 +355,8 @@ fn outside_table() -> Arc<NodeTable> {
 }
 
 /// The signs of a node where no part has a leaf; of no meaning elsewhere.
-fn combined_signs(parts: &[&Topology], rule: SignRule, node: IVec3) -> Box<NodeTable> {
-    let mut won = Box::new([false; NODE_ENTRIES]);
+fn combined_signs(parts: &[&Topology], rule: SignRule, node: IVec3) -> Arc<NodeTable> {
+    let mut won = [false; NODE_ENTRIES];
     for (part, topology) in parts.iter().enumerate() {
         let winner = rule.winner(part);
         match topology.nodes.get(&node) {
@@ -366,7 +365,7 @@ fn combined_signs(parts: &[&Topology], rule: SignRule, node: IVec3) -> Box<NodeT
             None => {}
         }
     }
-    Box::new(won.map(|won| LeafId::sentinel(won == rule.inside_wins)))
+    Arc::new(won.map(|won| LeafId::sentinel(won == rule.inside_wins)))
 }
 
 /// Puts `id` into the table at `origin`; returns what was there.
@@ -414,8 +413,11 @@ pub(super) struct Cursor<'a> {
 }
 
 impl<'a> Cursor<'a> {
-    pub fn new(topology: &'a Topology) -> Self {
-        let mut cursor = Self { topology, rest: topology.order.iter(), head: None, node: None };
+    /// A walk over the leaves whose origins have `from` <= x < `to`.
+    pub fn new(topology: &'a Topology, from: i32, to: i32) -> Self {
+        let before = |x: i32| topology.order.partition_point(|id| topology.origin(*id).x < x);
+        let rest = topology.order.get(before(from)..before(to)).unwrap_or_default().iter();
+        let mut cursor = Self { topology, rest, head: None, node: None };
         cursor.advance();
         cursor
     }

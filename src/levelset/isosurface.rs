@@ -7,12 +7,14 @@
 //! [`cell_case`](super::marching::cell_case): inside is connected through faces (6 neighbours), outside through faces
 //! and edges (18).
 
+use fearless_simd::{Simd, SimdBase, SimdMask};
 use glam::{DVec3, IVec3};
 
 use super::marching::{EDGES, cell_case};
 use crate::error::{EditError, Result};
 use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, LeafValues, Neighbours, neighbour_index, offset_to_local};
 use crate::run::RunOptions;
+use crate::stencil::simd::{Lanes, Work, dispatch};
 
 /// Vertices keep this distance, in voxels, from the ends of their grid edge, so that no two coincide and no triangle
 /// is degenerate where φ = iso at a voxel. Far below the accuracy of linear interpolation; still resolved by f32
@@ -285,12 +287,26 @@ pub(crate) fn corner(c: usize) -> IVec3 {
     IVec3::new((c >> 2) as i32, (c >> 1 & 1) as i32, (c & 1) as i32)
 }
 
+/// The voxels with φ < iso.
 fn inside_mask(values: &LeafValues, iso: f32) -> LeafMask {
-    LeafMask(std::array::from_fn(|x| {
-        let mut word = 0;
-        for (bit, value) in values.0[x * 64..(x + 1) * 64].iter().enumerate() {
-            word |= u64::from(*value < iso) << bit;
+    let mut mask = LeafMask::EMPTY;
+    dispatch(Inside { values, iso, mask: &mut mask });
+    mask
+}
+
+struct Inside<'a> {
+    values: &'a LeafValues,
+    iso: f32,
+    mask: &'a mut LeafMask,
+}
+
+impl Work for Inside<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let iso = Lanes::splat(simd, self.iso);
+        for (pair, values) in self.values.0.as_chunks::<16>().0.iter().enumerate() {
+            let inside = Lanes::from_slice(simd, values).simd_lt(iso).to_bitmask();
+            self.mask.0[pair / 4] |= inside << (16 * (pair % 4));
         }
-        word
-    }))
+    }
 }

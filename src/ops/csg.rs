@@ -7,7 +7,7 @@
 //! Only leaves that several operands have, and the leaves of what is cut away, are written; all others are shared with
 //! their operand.
 
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
+use fearless_simd::{Select, Simd, SimdBase, SimdMask};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -109,12 +109,7 @@ pub fn align(mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<(Vec<LevelSe
 /// One operation on level sets of the same lattice and half width, all at once: no grid between two of them is made.
 ///
 /// The result shares the pages of leaves that one of them alone decides.
-pub fn csg(
-    first: &LevelSet,
-    others: &[&LevelSet],
-    operation: CsgOperation,
-    run: &RunOptions,
-) -> Result<LevelSet> {
+pub fn csg(first: &LevelSet, others: &[&LevelSet], operation: CsgOperation, run: &RunOptions) -> Result<LevelSet> {
     let parts: Vec<&Grid> = std::iter::once(first).chain(others.iter().copied()).map(LevelSet::grid).collect();
     let union = operation == CsgOperation::Union;
     let rule = SignRule { inside_wins: union, complement_others: operation == CsgOperation::Difference };

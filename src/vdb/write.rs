@@ -69,6 +69,11 @@ pub fn write(
             "OpenVDB stores no voxels smaller than {SMALLEST_VOXEL} world units, these are {small:e}: scale the model up, as by `transform --scale 1000`"
         )));
     }
+    if let (Some(file), false) = (input, options.only_result) {
+        for index in (0..file.listing().grids.len()).filter(|index| grids.iter().all(|g| g.replaces != Some(*index))) {
+            file.check_present(index)?;
+        }
+    }
     let (mut content, count) = collect(grids, input, options).map_err(|e| output.error(e.what()))?;
     let bytes = output.write(content.pin_mut(), compression.flags())?;
     let mut warnings: Vec<_> =
@@ -230,10 +235,16 @@ impl Target<'_> {
         let _unfinished = Unfinished::new(temporary.path());
         let name = temporary.path().as_os_str().as_encoded_bytes();
         content.as_mut().write_path(name, compression).map_err(|e| self.error(e.what()))?;
-        temporary.as_file().sync_all().map_err(self.io("flushing"))?;
-        // Before reading back, so that the two copies are never in memory together.
-        content.as_mut().seal().map_err(|e| self.error(e.what()))?;
-        self.verify(&content, || ffi::read_path(name, false))?;
+        // The disk and the processor have different work to do.
+        let verified = std::thread::scope(|scope| {
+            let flushed = scope.spawn(|| temporary.as_file().sync_all());
+            // Sealed before it is read back, so that the two copies are never in memory together.
+            let sealed = content.as_mut().seal().map_err(|e| self.error(e.what()));
+            let verified = sealed.and_then(|()| self.verify(&content, || ffi::read_path(name, false)));
+            let flushed = flushed.join().unwrap_or_else(|_| Err(std::io::Error::other("the flushing thread failed")));
+            flushed.map_err(self.io("flushing")).and(verified)
+        });
+        verified?;
         let bytes = temporary.as_file().metadata().map_err(self.io("flushing"))?.len();
         if let Some(old) = old {
             temporary.as_file().set_permissions(old.permissions()).map_err(self.io("setting its permissions"))?;
