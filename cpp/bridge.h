@@ -71,6 +71,11 @@ std::unique_ptr<Archive> read_bytes(rust::Slice<const std::uint8_t> bytes, bool 
 /// Lets go of the voxels of grid `index`; its name, metadata and transform stay.
 void release_voxels(Archive& archive, std::size_t index);
 
+/// Reads a whole file as `read_path` does and keeps only a fingerprint of each grid's voxels, for `Output::verify`.
+std::unique_ptr<Archive> fingerprint_path(rust::Slice<const std::uint8_t> path);
+/// The same from memory.
+std::unique_ptr<Archive> fingerprint_bytes(rust::Slice<const std::uint8_t> bytes);
+
 /// The leaves of one float or double grid, listed once, for bulk copies. Const calls may run in parallel.
 class Leaves {
 public:
@@ -145,7 +150,7 @@ public:
     std::unique_ptr<std::string> write_bytes(std::uint32_t compression);
     /// Lets go of the grids and keeps what `verify` compares with.
     void seal();
-    /// Empty when `archive` holds what was written, else what differs.
+    /// Empty when `archive`, of fingerprints, holds what was written, else what differs.
     rust::String verify(const Archive& archive) const;
 
     std::unique_ptr<Impl> impl;

@@ -72,9 +72,16 @@ pub struct Row {
 }
 
 impl Row {
-    /// Whether the difference is within the tolerance.
+    /// Whether the difference is within the tolerance. A mesh must also have OpenVDB's area and volume to 0.1 %, or be nearer
+    /// than OpenVDB's to those of the mesh that the level set was made from, if there is one.
     pub fn passes(&self) -> bool {
+        let right = |difference: Option<f64>, to_source: Option<[f64; 2]>| {
+            let alike = difference.is_none_or(|d| d.abs() <= 1e-3);
+            alike || to_source.is_none_or(|[ours, theirs]| ours.abs() <= theirs.abs())
+        };
         self.max_diff_voxels <= self.tolerance_voxels
+            && right(self.area_difference, self.area_to_source)
+            && right(self.volume_difference, self.volume_to_source)
     }
 }
 

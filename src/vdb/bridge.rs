@@ -74,6 +74,8 @@ pub(super) mod ffi {
         fn grid_header(self: &Archive, index: usize) -> Result<GridHeader>;
         fn read_path(path: &[u8], headers_only: bool) -> Result<UniquePtr<Archive>>;
         fn read_bytes(bytes: &[u8], headers_only: bool) -> Result<UniquePtr<Archive>>;
+        fn fingerprint_path(path: &[u8]) -> Result<UniquePtr<Archive>>;
+        fn fingerprint_bytes(bytes: &[u8]) -> Result<UniquePtr<Archive>>;
         fn release_voxels(archive: Pin<&mut Archive>, index: usize) -> Result<()>;
         fn grid_fingerprint(archive: &Archive, index: usize) -> Result<String>;
 

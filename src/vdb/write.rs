@@ -214,7 +214,7 @@ impl Target<'_> {
     ) -> Result<u64> {
         let bytes = content.as_mut().write_bytes(compression).map_err(|e| self.error(e.what()))?;
         content.as_mut().seal().map_err(|e| self.error(e.what()))?;
-        self.verify(&content, || ffi::read_bytes(bytes.as_bytes(), false))?;
+        self.verify(&content, || ffi::fingerprint_bytes(bytes.as_bytes()))?;
         to.write_all(bytes.as_bytes()).and_then(|()| to.flush()).map_err(self.io("writing"))?;
         Ok(bytes.len() as u64)
     }
@@ -240,7 +240,7 @@ impl Target<'_> {
             let flushed = scope.spawn(|| temporary.as_file().sync_all());
             // Sealed before it is read back, so that the two copies are never in memory together.
             let sealed = content.as_mut().seal().map_err(|e| self.error(e.what()));
-            let verified = sealed.and_then(|()| self.verify(&content, || ffi::read_path(name, false)));
+            let verified = sealed.and_then(|()| self.verify(&content, || ffi::fingerprint_path(name)));
             let flushed = flushed.join().unwrap_or_else(|_| Err(std::io::Error::other("the flushing thread failed")));
             flushed.map_err(self.io("flushing")).and(verified)
         });
