@@ -57,6 +57,14 @@ void filter_mean_curvature(FloatGrid& grid, std::size_t steps, const TrackerOpti
     });
 }
 
+void filter_mean_curvature_masked(FloatGrid& grid, const FloatGrid& mask, const TrackerOptions& options)
+{
+    with_filter(grid, options, [&mask](auto& filter) {
+        filter.setMaskRange(0.0f, 1.0f);
+        filter.meanCurvature(mask.impl->grid.get());
+    });
+}
+
 void filter_laplacian(FloatGrid& grid, std::size_t steps, const TrackerOptions& options)
 {
     with_filter(grid, options, [steps](auto& filter) {

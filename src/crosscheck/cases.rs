@@ -4,15 +4,20 @@ use glam::Vec3;
 
 use super::Input;
 use super::contest::{Contest, GridContest, Judge, Operation};
+use super::files::{Reading, Writing};
+use super::polygons::Polygonising;
 use crate::error::{EditError, Result};
-use crate::grid::Transform;
+use crate::grid::{Transform, offset_to_local};
 use crate::levelset::{LevelSet, sweep_distance};
 use crate::mesh::{MeshToLevelSet, Rebuild, mesh_to_level_set, rebuild};
 use crate::ops::csg::{CsgOperation, csg};
 use crate::ops::morphology::offset;
 use crate::ops::smooth::{Smooth, SmoothMethod, smooth};
-use crate::ops::{EvolutionOptions, Like, Scheme};
-use crate::pde::{MorphOptions, SolverOptions, Until, UpwindScheme, WenoEpsilon, morph_towards, renormalize, track};
+use crate::ops::{EvolutionOptions, Like, RegionSpecs, Scheme};
+use crate::pde::{
+    self, MorphOptions, SolverOptions, Until, UpwindScheme, WenoEpsilon, morph_towards, renormalize, track,
+};
+use crate::region::Primitive;
 use crate::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceScheme, Tracker};
 
 /// A row of the table.
@@ -29,9 +34,17 @@ pub(super) struct Case {
 
 const FIRST_STEP: &str = "one step and track, first order, RK1, 1";
 
+const FILTER: &str = "width 1, HJ-WENO5, RK1, 3";
+
 /// All rows, in order.
 pub(super) const CASES: &[Case] = &[
     Case { operator: "mean-curvature", scheme: FIRST_STEP, tolerance: 1e-5, contest: mean_curvature },
+    Case {
+        operator: "masked-mean-curvature",
+        scheme: "8 % of the surface, one step and track, first order, RK1, 1; compared where the weight is 1, five voxels inside",
+        tolerance: 1e-5,
+        contest: masked_mean_curvature,
+    },
     Case { operator: "laplacian", scheme: FIRST_STEP, tolerance: 1e-5, contest: laplacian },
     Case {
         operator: "mean-curvature-default",
@@ -42,12 +55,16 @@ pub(super) const CASES: &[Case] = &[
     Case { operator: "normalize-first", scheme: "first order, RK1, 1", tolerance: 1e-5, contest: normalize_first },
     Case { operator: "normalize-weno5", scheme: "HJ-WENO5, RK1, 1", tolerance: 1e-5, contest: normalize_weno5 },
     Case { operator: "track", scheme: "HJ-WENO5, RK1, 3", tolerance: 1e-5, contest: whole_track },
+    Case { operator: "offset-pde", scheme: "one voxel, HJ-WENO5, RK1, 3", tolerance: 1e-4, contest: offset_by_flow },
     Case {
         operator: "offset",
         scheme: "one voxel: exact, against HJ-WENO5, RK1, 3",
         tolerance: 0.05,
         contest: exact_offset,
     },
+    Case { operator: "gaussian", scheme: FILTER, tolerance: 1e-4, contest: gaussian },
+    Case { operator: "mean", scheme: FILTER, tolerance: 1e-4, contest: mean },
+    Case { operator: "median", scheme: FILTER, tolerance: 1e-4, contest: median },
     Case {
         operator: "morph",
         scheme: "towards a copy one voxel larger, time 1, HJ-WENO5, RK2; track HJ-WENO5, RK1, 3",
@@ -84,6 +101,19 @@ pub(super) const CASES: &[Case] = &[
         tolerance: 1e-3,
         contest: from_mesh,
     },
+    Case {
+        operator: "level-set-to-mesh",
+        scheme: "against volumeToMesh, adaptivity 0; distance of its vertices",
+        tolerance: 1.0,
+        contest: |input| Polygonising::new(input),
+    },
+    Case { operator: "read", scheme: "blosc, float", tolerance: 0.0, contest: |input| Reading::new(input) },
+    Case {
+        operator: "write",
+        scheme: "blosc, float; ours flushed and verified",
+        tolerance: 0.0,
+        contest: |input| Writing::new(input),
+    },
 ];
 
 const FIRST: Tracker = Tracker { scheme: ReferenceScheme::First, runge_kutta: 1, normalizations: 1 };
@@ -102,7 +132,7 @@ fn same<'a>(
     GridContest::new(input, Judge::Equal, Operation::in_place(ours), theirs)
 }
 
-/// One step of a smoothing flow.
+/// One step of a smoothing flow, or one application of a filter.
 fn flow<'a>(
     input: &'a Input<'a>,
     method: SmoothMethod,
@@ -111,7 +141,7 @@ fn flow<'a>(
     tracker: Tracker,
 ) -> Sides<'a> {
     let evolution = EvolutionOptions { iterations: Some(1), ..evolution };
-    let (params, run) = (Smooth { method, evolution }, input.run.clone());
+    let (params, run) = (Smooth { method, evolution, ..Smooth::default() }, input.run.clone());
     same(input, move |grid| smooth(grid, &params, &run).map(drop), filter, tracker)
 }
 
@@ -123,13 +153,77 @@ fn mean_curvature<'a>(input: &'a Input<'a>) -> Sides<'a> {
     flow(input, SmoothMethod::Curvature, first_order(), Filter::MeanCurvature(1), FIRST)
 }
 
+/// The part of the surface that a masked row works on.
+const MASKED: f64 = 0.08;
+
+/// In a sphere around the highest voxel. OpenVDB renormalises everywhere, ours where the region acts.
+fn masked_mean_curvature<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (grid, transform) = (input.level_set.grid(), *input.level_set.transform());
+    let mut voxels = Vec::new();
+    for &id in grid.leaves() {
+        voxels.extend(grid.mask(id).iter().map(|o| transform.voxel_to_world(grid.origin(id) + offset_to_local(o))));
+    }
+    let Some(&centre) = voxels.iter().max_by(|a, b| a.z.total_cmp(&b.z)) else {
+        return Err(EditError::parameter("crosscheck", "only", "masked-mean-curvature", "a level set with a surface"));
+    };
+    let mut distances: Vec<f64> = voxels.iter().map(|voxel| voxel.distance(centre)).collect();
+    distances.sort_by(f64::total_cmp);
+    let radius = distances[(distances.len() as f64 * MASKED) as usize];
+    let spec = format!("sphere center={},{},{} radius={radius}", centre.x, centre.y, centre.z);
+    let evolution = EvolutionOptions { iterations: Some(1), region: RegionSpecs(vec![spec]), ..first_order() };
+    let region = evolution.region.on(input.level_set, input.run)?;
+    let mut weights = input.level_set.clone();
+    weights.grid_mut().update_all(|id, values, _| {
+        let origin = grid.origin(id);
+        for (offset, value) in values.0.iter_mut().enumerate() {
+            let xyz = transform.voxel_to_world(origin + offset_to_local(offset));
+            *value = region.as_ref().map_or(1.0, |region| region.weight(xyz));
+        }
+    });
+    let weights = ReferenceGrid::from_level_set(&weights)?;
+    let inside = Primitive::DEFAULT_SOFT[0] * radius - 5.0 * transform.voxel_size();
+    let counts = move |ijk| transform.voxel_to_world(ijk).distance(centre) < inside;
+    let (params, run) = (Smooth { evolution, ..Smooth::default() }, input.run.clone());
+    GridContest::new(
+        input,
+        Judge::EqualAt(Box::new(counts)),
+        Operation::in_place(move |grid| smooth(grid, &params, &run).map(drop)),
+        Operation::in_place(move |grid: &mut ReferenceGrid| grid.mean_curvature_masked(&weights, &FIRST)),
+    )
+}
+
 fn laplacian<'a>(input: &'a Input<'a>) -> Sides<'a> {
     flow(input, SmoothMethod::Laplacian, first_order(), Filter::Laplacian(1), FIRST)
 }
 
+fn like_openvdb() -> EvolutionOptions {
+    EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() }
+}
+
 fn mean_curvature_default<'a>(input: &'a Input<'a>) -> Sides<'a> {
-    let like = EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() };
-    flow(input, SmoothMethod::Curvature, like, Filter::MeanCurvature(1), Tracker::default())
+    flow(input, SmoothMethod::Curvature, like_openvdb(), Filter::MeanCurvature(1), Tracker::default())
+}
+
+fn gaussian<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Gaussian, like_openvdb(), Filter::Gaussian(1), Tracker::default())
+}
+
+fn mean<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Mean, like_openvdb(), Filter::Mean(1), Tracker::default())
+}
+
+fn median<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Median, like_openvdb(), Filter::Median(1), Tracker::default())
+}
+
+fn offset_by_flow<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (voxel, run) = (input.level_set.voxel_size(), input.run.clone());
+    same(
+        input,
+        move |grid| pde::offset(grid, voxel, None, &SolverOptions::OPENVDB, &run).map(drop),
+        Filter::Offset(voxel as f32),
+        Tracker::default(),
+    )
 }
 
 fn normalize_first<'a>(input: &'a Input<'a>) -> Sides<'a> {
@@ -179,11 +273,11 @@ fn morph<'a>(input: &'a Input<'a>) -> Sides<'a> {
 
 fn csg_union<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let shifted = shifted(input.level_set)?;
-    let reference = ReferenceGrid::from_level_set(&shifted)?;
+    let (reference, run) = (ReferenceGrid::from_level_set(&shifted)?, input.run.clone());
     GridContest::new(
         input,
         Judge::Equal,
-        Operation::new(move |grid| Ok(csg(grid, &shifted, CsgOperation::Union))),
+        Operation::new(move |grid| csg(grid, &[&shifted], CsgOperation::Union, &run)),
         Operation::new(move |grid: &ReferenceGrid| grid.csg(&reference, Csg::Union)),
     )
 }

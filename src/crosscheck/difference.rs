@@ -17,6 +17,15 @@ pub(super) struct Difference {
     pub active: u64,
     /// OpenVDB's largest error, where both are held against the truth.
     pub openvdb_max: Option<f64>,
+    /// Of meshes: area and volume of ours over OpenVDB's, less 1.
+    pub area: Option<f64>,
+    pub volume: Option<f64>,
+    /// The same of ours and of OpenVDB's over the mesh that the level set was made from.
+    pub area_to_source: Option<[f64; 2]>,
+    pub volume_to_source: Option<[f64; 2]>,
+    /// Of files: the number of leaves, and the time that copying one to OpenVDB takes.
+    pub leaves: Option<f64>,
+    pub copy_us_a_leaf: Option<f64>,
 }
 
 impl Difference {

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::paged::{LeafId, PAGE_LEAVES, PageLeaves};
+use super::paged::{LeafId, PageLeaves};
 
 /// A set of leaf slots. The word of a page tells a parallel task which of its 64 leaves are meant.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

@@ -8,12 +8,14 @@
 //! origins and does not.
 
 mod accessor;
+mod combine;
 mod leaf;
 mod leaf_set;
 mod page_pool;
 mod paged;
 mod topology;
 mod transform;
+mod volume;
 
 use std::sync::Arc;
 
@@ -21,12 +23,14 @@ use glam::IVec3;
 use rayon::prelude::*;
 
 pub use accessor::Accessor;
+pub use combine::{Combination, SignRule};
 pub use leaf::{Face, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset, leaf_origin, offset_to_local};
 pub use leaf_set::LeafSet;
 pub use paged::{LeafId, PAGE_LEAVES, PageLeaves, Paged};
 use topology::Topology;
 pub use topology::{Neighbours, neighbour_index};
 pub use transform::{Transform, VOXEL_SIZES};
+pub use volume::Volume;
 
 /// Largest index coordinate of a voxel, either sign: beyond it the arithmetic of neighbours could overflow.
 pub const MAX_COORD: i32 = 1 << 30;
@@ -69,6 +73,14 @@ impl Grid {
     pub(crate) fn zeroed(&self) -> Self {
         let values = Paged::filled(self.topology.page_count(), LeafValues::default());
         Self { background: 0.0, topology: self.topology.clone(), values, masks: self.masks.clone() }
+    }
+
+    /// A copy that shares nothing with this grid.
+    pub fn deep_copy(&self) -> Self {
+        let mut copy = self.clone();
+        Arc::make_mut(&mut copy.topology).unshare();
+        copy.update_all(|_, _, _| ());
+        copy
     }
 
     /// The value that stands for everything outside; its negative for everything inside.
@@ -178,8 +190,8 @@ impl Grid {
         &self.masks
     }
 
-    /// Origins of the absent leaves that face neighbours of the voxels of `seed` lie in, sorted. `seed` has the pages of this grid.
-    pub fn absent_beside(&self, seed: &Paged<LeafMask>) -> Vec<IVec3> {
+    /// Origins of the absent leaves that face neighbours of the voxels of `seed` lie in, sorted. `seed` is empty but in the leaves of `set`.
+    pub fn absent_beside(&self, seed: &Paged<LeafMask>, set: &LeafSet) -> Vec<IVec3> {
         let around = self.neighbours();
         let beside = |id: LeafId| {
             let around = &around[id.index()];
@@ -188,14 +200,13 @@ impl Grid {
                 absent.then(|| self.origin(id) + face.step() * LEAF_DIM)
             })
         };
-        let mut origins: Vec<IVec3> =
-            self.leaves().par_iter().with_min_len(PAGE_LEAVES).flat_map_iter(|&id| beside(id)).collect();
+        let mut origins: Vec<IVec3> = set.par_pages().flat_map_iter(|leaves| leaves.iter().flat_map(beside)).collect();
         origins.sort_unstable_by_key(|o| (o.x, o.y, o.z));
         origins.dedup();
         origins
     }
 
-    /// Activates the voxels of `seed` and their face neighbours, in the leaves of `set`.
+    /// Activates the voxels of `seed` and their face neighbours, in the leaves of `set`. `seed` has the pages of this grid.
     pub fn activate_beside(&mut self, seed: &Paged<LeafMask>, set: &LeafSet) {
         let around = self.topology.neighbours();
         self.masks.par_update(set, |id, mask| {
@@ -245,12 +256,15 @@ impl Grid {
         let added = topology.insert(origins);
         self.values.grow_unwritten(topology.page_count());
         self.masks.grow(topology.page_count(), LeafMask::EMPTY);
-        for &(id, sentinel) in &added {
-            let value = if sentinel == LeafId::INSIDE { -self.background } else { self.background };
-            self.values.get_mut(id).0.fill(value);
-            *self.masks.get_mut(id) = LeafMask::EMPTY;
-        }
-        added.into_iter().map(|(id, _)| id).collect()
+        let inside: LeafSet =
+            added.iter().filter(|(_, sentinel)| *sentinel == LeafId::INSIDE).map(|(id, _)| *id).collect();
+        let added: Vec<LeafId> = added.into_iter().map(|(id, _)| id).collect();
+        let (set, background) = (added.iter().copied().collect(), self.background);
+        self.update(&set, |id, values, mask| {
+            values.0.fill(if inside.contains(id) { -background } else { background });
+            *mask = LeafMask::EMPTY;
+        });
+        added
     }
 
     /// Removes those of `candidates` that have no active voxel and one sign, which stays known.

@@ -7,6 +7,7 @@ mod build;
 mod check;
 mod components;
 mod curvature;
+mod curve;
 pub(crate) mod dual;
 mod field;
 pub(crate) mod isosurface;
@@ -23,7 +24,7 @@ mod violation;
 
 use glam::{DVec3, IVec3};
 
-pub(crate) use build::grid_of_leaves;
+pub(crate) use build::{BYTES_A_LEAF, grid_of_leaves, grid_of_parts};
 pub use components::Components;
 pub use curvature::{CurvatureKind, curvature};
 pub use field::Field;

@@ -22,22 +22,22 @@ impl Tracker<'_> {
 
     /// Activates the face neighbours of the voxels that may have moved. They start at ±background.
     pub fn dilate_band(&mut self) {
-        let added = self.grid.add_leaves(&self.grid.absent_beside(&self.moving()));
-        let pages = self.grid.value_pages().page_count();
+        let moving = self.moving();
+        let reached = self.reached_leaves(&moving);
+        self.domain.include_old(self.grid, &reached);
+        let added = self.grid.add_leaves(&self.grid.absent_beside(&moving, self.domain.leaves()));
+        let (grid, new) = (&*self.grid, added.iter().copied().collect());
         for buffer in &mut self.buffers {
-            buffer.grow_unwritten(pages);
-            for &id in &added {
-                buffer.get_mut(id).clone_from(self.grid.values(id));
-            }
+            buffer.grow_unwritten(grid.value_pages().page_count());
+            buffer.par_update(&new, |id, values| values.clone_from(grid.values(id)));
         }
-        let reached = self.reached_leaves();
-        self.domain.include(&added, pages);
-        self.domain.include(&reached, pages);
-        if let (Some(weights), Some(region)) = (self.domain.weights_mut(), self.region) {
-            weights.extend(self.grid, &self.transform, region, &added);
-        }
+        self.domain.include_new(self.grid, &added);
+        // Asked again: slots of new leaves may have belonged to others before.
         let moving = self.moving();
         self.grid.activate_beside(&moving, self.domain.leaves());
+        if let Some(region) = self.region {
+            self.domain.weigh(self.grid, &self.transform, region);
+        }
     }
 
     /// After a trimming step: puts the second buffers in step with φ, and removes the leaves that were left empty. `emptied` is sorted by leaf.
@@ -69,17 +69,16 @@ impl Tracker<'_> {
     }
 
     /// Leaves outside the domain that its moving voxels border on.
-    fn reached_leaves(&self) -> Vec<LeafId> {
+    fn reached_leaves(&self, moving: &Paged<LeafMask>) -> Vec<LeafId> {
         if !self.domain.is_local() {
             return Vec::new();
         }
         let around = self.grid.neighbours();
         let mut reached = Vec::new();
         for id in self.domain.leaves().iter() {
-            let moving = self.domain.moving(id, self.grid.mask(id));
             for face in Face::ALL {
                 let n = around[id.index()][neighbour_index(face.step())];
-                if !n.is_sentinel() && !self.domain.leaves().contains(n) && !moving.spill(face).is_empty() {
+                if !n.is_sentinel() && !self.domain.leaves().contains(n) && !moving.get(id).spill(face).is_empty() {
                     reached.push(n);
                 }
             }

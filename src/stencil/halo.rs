@@ -24,6 +24,10 @@ pub trait LeafHalo: Default {
     fn beside<S: Simd>(&self, simd: S, x: usize, y: usize, axis: usize) -> [Lanes<S>; 2];
 }
 
+/// A leaf and its 26 neighbours.
+const ALL: [usize; 27] =
+    [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26];
+
 /// A leaf with a rim of one voxel: for stencils over the 27 voxels around each.
 #[repr(align(64))]
 pub struct Halo {
@@ -40,7 +44,7 @@ impl Halo {
     /// Copies the leaf in the middle of `around` and the rim from its 26 neighbours.
     #[inline(always)]
     pub fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
-        let leaves = leaves(values, around);
+        let leaves = leaves(values, around, ALL);
         for x in 0..10 {
             // The neighbour in x, and the slab of it.
             let (i, from) = match x {
@@ -129,11 +133,7 @@ impl<const REACH: usize> StarHalo<REACH> {
     /// Copies the leaf in the middle of `around` and the voxels beyond each of its faces.
     #[inline(always)]
     pub fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
-        // Looked up once each: neighbours along the axes, before and after.
-        let [centre, xm, xp, ym, yp, zm, zp] = [13, 4, 22, 10, 16, 12, 14].map(
-            #[inline(always)]
-            |q: usize| &values.get(around[q]).0,
-        );
+        let [centre, xm, xp, ym, yp, zm, zp] = leaves(values, around, [13, 4, 22, 10, 16, 12, 14]);
         for x in 0..REACH {
             self.slabs[2 - x][24..88].copy_from_slice(slab(xm, 7 - x));
             self.slabs[11 + x][24..88].copy_from_slice(slab(xp, x));
@@ -211,13 +211,19 @@ impl<const REACH: usize> Default for StarHalo<REACH> {
     }
 }
 
-/// The values of a leaf and its neighbours.
+/// The values of some of the leaves around and including one.
 #[inline(always)]
-fn leaves<'a>(values: &'a Paged<LeafValues>, around: &Neighbours) -> [&'a [f32; LEAF_VOXELS]; 27] {
-    around.map(
-        #[inline(always)]
-        |id| &values.get(id).0,
-    )
+fn leaves<'a, const N: usize>(
+    values: &'a Paged<LeafValues>,
+    around: &Neighbours,
+    which: [usize; N],
+) -> [&'a [f32; LEAF_VOXELS]; N] {
+    // Not by `map`, which would not be inlined.
+    let mut leaves = [&values.get(around[which[0]]).0; N];
+    for (leaf, q) in leaves.iter_mut().zip(which) {
+        *leaf = &values.get(around[q]).0;
+    }
+    leaves
 }
 
 /// The 64 values of slab x of a leaf.

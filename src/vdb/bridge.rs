@@ -74,6 +74,9 @@ pub(super) mod ffi {
         fn grid_header(self: &Archive, index: usize) -> Result<GridHeader>;
         fn read_path(path: &[u8], headers_only: bool) -> Result<UniquePtr<Archive>>;
         fn read_bytes(bytes: &[u8], headers_only: bool) -> Result<UniquePtr<Archive>>;
+        fn fingerprint_path(path: &[u8]) -> Result<UniquePtr<Archive>>;
+        fn fingerprint_bytes(bytes: &[u8]) -> Result<UniquePtr<Archive>>;
+        fn release_voxels(archive: Pin<&mut Archive>, index: usize) -> Result<()>;
         fn grid_fingerprint(archive: &Archive, index: usize) -> Result<String>;
 
         type Leaves;
@@ -113,6 +116,9 @@ pub(super) mod ffi {
         fn seal(self: Pin<&mut Output>) -> Result<()>;
         fn verify(self: &Output, archive: &Archive) -> Result<String>;
 
+        fn plain_write(grid: &FloatGrid, path: &[u8]) -> Result<()>;
+        fn plain_read(path: &[u8]) -> Result<UniquePtr<FloatGrid>>;
+
         type RawMesh;
         fn point_count(self: &RawMesh) -> usize;
         fn triangle_count(self: &RawMesh) -> usize;
@@ -122,6 +128,11 @@ pub(super) mod ffi {
         fn quads(self: &RawMesh, out: &mut [u32]) -> Result<()>;
         fn copy_grid(grid: &FloatGrid) -> Result<UniquePtr<FloatGrid>>;
         fn filter_mean_curvature(grid: Pin<&mut FloatGrid>, steps: usize, tracker: &TrackerOptions) -> Result<()>;
+        fn filter_mean_curvature_masked(
+            grid: Pin<&mut FloatGrid>,
+            mask: &FloatGrid,
+            tracker: &TrackerOptions,
+        ) -> Result<()>;
         fn filter_laplacian(grid: Pin<&mut FloatGrid>, steps: usize, tracker: &TrackerOptions) -> Result<()>;
         fn filter_gaussian(grid: Pin<&mut FloatGrid>, width: i32, tracker: &TrackerOptions) -> Result<()>;
         fn filter_mean(grid: Pin<&mut FloatGrid>, width: i32, tracker: &TrackerOptions) -> Result<()>;
