@@ -10,7 +10,7 @@
 //! and no mesh is made; but errors grow with the distance from edges and points (half a voxel and more at ten voxels from an edge). Right for
 //! flows, whose fields are nearly distances, and for extending fields; offsets and bands of many voxels are better rebuilt.
 
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
+use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 
 use super::{Field, LevelSet, background};
 use crate::error::{EditError, Result};
