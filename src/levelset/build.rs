@@ -62,15 +62,22 @@ impl LevelSet {
     }
 }
 
-/// A grid of the given leaves, sorted here; the signs of the space between are flooded from them.
-pub(crate) fn grid_of_leaves(background: f32, mut leaves: Vec<(IVec3, LeafValues, LeafMask)>) -> Grid {
+/// A grid of the given leaves, in any order; the signs of the space between are flooded from them.
+pub(crate) fn grid_of_leaves(background: f32, leaves: Vec<(IVec3, LeafValues, LeafMask)>) -> Grid {
+    grid_of_parts(background, vec![leaves])
+}
+
+/// [`grid_of_leaves`] of several lists together: what parallel tasks made need not be moved into one.
+pub(crate) fn grid_of_parts(background: f32, parts: Vec<Vec<(IVec3, LeafValues, LeafMask)>>) -> Grid {
+    // References are sorted, not leaves of two kilobytes.
+    let mut leaves: Vec<&(IVec3, LeafValues, LeafMask)> = parts.iter().flatten().collect();
     leaves.par_sort_unstable_by_key(|(o, ..)| (o.x, o.y, o.z));
     let origins: Vec<IVec3> = leaves.iter().map(|l| l.0).collect();
     let mut grid = Grid::from_origins(background, &origins);
     // A fresh grid has its leaves in slot order, so the leaf of an id is found by counting.
     let first = grid.leaves().first().map_or(0, |id| id.index());
     grid.update_all(|id, values, mask| {
-        let (_, v, m) = &leaves[id.index() - first];
+        let (_, v, m) = leaves[id.index() - first];
         values.clone_from(v);
         *mask = *m;
     });

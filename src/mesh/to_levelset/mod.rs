@@ -14,6 +14,7 @@ mod inside;
 mod intersect;
 mod pieces;
 
+use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -23,13 +24,14 @@ use inside::{Inside, OpenInside, Rim};
 use pieces::separating_pieces;
 
 use super::prepare::prepare;
-use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes};
+use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes, leaves_near_triangles};
 use super::topology::{boundary_chain, edge_uses};
 use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber};
 use crate::error::{EditError, Result};
-use crate::grid::{LeafMask, LeafValues, MAX_COORD, Transform, VOXEL_SIZES};
-use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, background, grid_of_leaves};
+use crate::grid::{LEAF_VOXELS, LeafMask, LeafValues, MAX_COORD, Transform, VOXEL_SIZES};
+use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, background, grid_of_parts};
 use crate::run::RunOptions;
+use crate::stencil::simd::{Lanes, Work, dispatch};
 
 const OPERATION: &str = "mesh to level set";
 /// The narrowest band, in voxels, that has both neighbours of every sign change in it, and room for a gradient.
@@ -94,21 +96,23 @@ pub fn mesh_to_level_set(
 
     let corners = |t: usize| clean.corners(t);
     let count = clean.triangles.len();
-    let closed = boundary_chain(&edge_uses(&clean.triangles)).is_empty();
+    let closed = findings.converted.closed || boundary_chain(&edge_uses(&clean.triangles)).is_empty();
     let crossings = closed.then(|| Crossings::new(count, corners));
     findings.self_intersecting = crossings.as_ref().is_some_and(|c| c.overlaps() > 0 || overlaps_sideways(&clean));
     if params.strict && !findings.is_sound() {
         return Err(EditError::input("mesh", format!("refused (strict): {}", findings.warnings().join("; "))));
     }
-    let distances = distance_to_triangles(count, corners, params.half_width, run)?;
     let transform = Transform::uniform(params.voxel_size);
+    let background = background(params.half_width, &transform);
     let leaves = match crossings {
         Some(crossings) if !findings.self_intersecting => {
-            sign(distances, &transform, params.half_width, |origin| crossings.inside(origin))
+            leaves_near_triangles(count, corners, params.half_width, run, |origin, distance| {
+                signed(origin, distance, &crossings.inside(origin), params.voxel_size, background)
+            })?
         }
-        crossings => repair(&clean, distances, crossings, params, &mut findings, run)?,
+        crossings => vec![repair(&clean, crossings, params, &mut findings, run)?],
     };
-    let level_set = LevelSet::new(grid_of_leaves(background(params.half_width, &transform), leaves), transform);
+    let level_set = LevelSet::new(grid_of_parts(background, leaves), transform);
     if !encloses_a_voxel(&level_set) {
         return Err(encloses_nothing(closed, &findings, params));
     }
@@ -118,13 +122,13 @@ pub fn mesh_to_level_set(
 /// Signed leaves of a surface that overlaps itself or is open.
 fn repair(
     clean: &TriangleMesh,
-    distances: Vec<UnsignedLeaf>,
     crossings: Option<Crossings>,
     params: &MeshToLevelSet,
     findings: &mut MeshFindings,
     run: &RunOptions,
 ) -> Result<Vec<SignedLeaf>> {
     let half_width = params.half_width;
+    let distances = distance_to_triangles(clean.triangles.len(), |t| clean.corners(t), half_width, run)?;
     let bvh = Bvh::new((0..clean.triangles.len()).map(|t| clean.corners(t)).collect());
     let winding = WindingNumber::new(&bvh);
     let rim = Rim::new(&clean.positions, &clean.triangles);
@@ -149,36 +153,55 @@ fn repair(
     kept.merge(distance_to_triangles(closure.len(), |t| closure[t], half_width, run)?);
     let unsigned: Vec<_> = kept.origins().filter(|o| surroundings.mask(*o).is_none()).collect();
     surroundings.extend(&unsigned);
-    let mask = |origin| surroundings.mask(origin).copied().unwrap_or_default();
-    Ok(sign(kept.into_leaves(), &Transform::uniform(params.voxel_size), half_width, mask))
+    let background = background(half_width, &Transform::uniform(params.voxel_size));
+    let signed = |leaf: &UnsignedLeaf| {
+        let inside = surroundings.mask(leaf.origin).copied().unwrap_or_default();
+        signed(leaf.origin, &leaf.distance, &inside, params.voxel_size, background)
+    };
+    Ok(kept.leaves().par_iter().filter_map(signed).collect())
 }
 
 /// Values and mask of a leaf at its origin.
 type SignedLeaf = (glam::IVec3, LeafValues, LeafMask);
 
-/// World-space signed distances and active masks from distances in voxels and the inside of each leaf.
-fn sign(
-    leaves: Vec<UnsignedLeaf>,
-    transform: &Transform,
-    half_width: f32,
-    inside: impl Fn(glam::IVec3) -> LeafMask + Sync,
-) -> Vec<SignedLeaf> {
-    let scale = transform.voxel_size();
-    let background = background(half_width, transform);
-    leaves
-        .into_par_iter()
-        .filter_map(|UnsignedLeaf { origin, distance: mut values }| {
-            let inside = inside(origin);
-            let mut active = LeafMask::EMPTY;
-            for (offset, value) in values.0.iter_mut().enumerate() {
-                let distance = (f64::from(*value) * scale) as f32;
-                active.set(offset, distance < background);
-                let magnitude = if distance < background { distance } else { background };
-                *value = if inside.get(offset) { -magnitude } else { magnitude };
-            }
-            (!active.is_empty()).then_some((origin, values, active))
-        })
-        .collect()
+/// World-space signed distances and active mask from distances in voxels and the inside of a leaf; `None` where none is in
+/// the band.
+fn signed(
+    origin: glam::IVec3,
+    distance: &LeafValues,
+    inside: &LeafMask,
+    voxel_size: f64,
+    background: f32,
+) -> Option<SignedLeaf> {
+    let mut leaf = (origin, LeafValues::default(), LeafMask::EMPTY);
+    let (_, values, active) = &mut leaf;
+    dispatch(Sign { distance, inside, voxel_size: voxel_size as f32, background, values, active });
+    (!leaf.2.is_empty()).then_some(leaf)
+}
+
+/// Scales distances, cuts them at the background and gives them their signs.
+struct Sign<'a> {
+    distance: &'a LeafValues,
+    inside: &'a LeafMask,
+    voxel_size: f32,
+    background: f32,
+    values: &'a mut LeafValues,
+    active: &'a mut LeafMask,
+}
+
+impl Work for Sign<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        for at in (0..LEAF_VOXELS).step_by(16) {
+            let (word, shift) = (at / 64, at % 64);
+            let phi = Lanes::from_slice(simd, &self.distance.0[at..at + 16]) * self.voxel_size;
+            let active = phi.simd_lt(self.background);
+            self.active.0[word] |= active.to_bitmask() << shift;
+            let magnitude = active.select(phi, Lanes::splat(simd, self.background));
+            let inside = mask32x16::from_bitmask(simd, self.inside.0[word] >> shift & 0xffff);
+            inside.select(-magnitude, magnitude).store_slice(&mut self.values.0[at..at + 16]);
+        }
+    }
 }
 
 /// Refuses indices out of range and positions that are no numbers.
