@@ -1,7 +1,7 @@
 # The two commands that do all the set-up on a fresh Debian or Ubuntu machine with cargo:
 #   make demo    build, then an editing session on the models in assets/; results in out/
 #   make test    the whole test suite
-.PHONY: help setup demo test nightly blender ci clean
+.PHONY: help setup demo test bench nightly blender ci clean
 .DEFAULT_GOAL := help
 
 CARGO ?= cargo
@@ -11,6 +11,7 @@ export PATH := $(PATH):$(HOME)/.cargo/bin
 help:
 	@echo 'make demo     build in release mode, edit two models, leave .vdb, .obj and .png in out/'
 	@echo 'make test     the whole test suite'
+	@echo 'make bench    kernels, every operator beside OpenVDB, cost and memory by size'
 	@echo 'make nightly  the test suite in release mode with the slow tests, and without OpenVDB'
 	@echo 'make blender  open a level set of this tool in Blender (downloads 374 MB once)'
 	@echo 'make ci       everything that .ci/run checks'
@@ -25,6 +26,9 @@ demo: setup
 
 test: setup
 	$(CARGO) test --locked --no-fail-fast
+
+bench: setup
+	$(CARGO) bench --locked --benches
 
 # --tests leaves the documentation's examples out: --include-ignored would run those that are marked as not to be run.
 nightly: setup

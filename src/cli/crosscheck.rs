@@ -6,7 +6,7 @@ use serde_json::json;
 use super::context::Context;
 use super::input::{self, InputOptions};
 use super::{Verb, args, table};
-use crate::crosscheck::{OPERATORS, Row, crosscheck};
+use crate::crosscheck::{Row, crosscheck, operators};
 use crate::error::{EditError, Result};
 use crate::mesh::MeshFormat;
 
@@ -19,7 +19,7 @@ fn build(command: Command) -> Command {
         .long_about(format!(
             "Run our operators and OpenVDB's own tools on the same grid, in turn, and compare times and results; exit with 1 \
              when a result is above its tolerance.\n\nOperators: {}.",
-            OPERATORS.join(", ")
+            operators().collect::<Vec<_>>().join(", ")
         ))
         .arg(args::path("input").value_name("IN").required(true).help("A .vdb or a mesh"))
         .arg(
@@ -44,7 +44,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         Some(_) => Some(input::read_mesh(&input.path, &mut Vec::new())?),
         None => None,
     };
-    let rows = crosscheck(&input.level_set, source, &only, &context.run, |_| ())?;
+    let rows = crosscheck(&input.level_set, source.as_ref(), &only, &context.run, |_| ())?;
     let value = json!({
         "file": input.path.display().to_string(),
         "active_voxels": input.level_set.grid().active_voxels(),
