@@ -138,8 +138,8 @@ std::unique_ptr<FloatGrid> mesh_to_level_set(rust::Slice<const float> points, ru
     }
     for (auto& vertex : vertices) vertex = openvdb::Vec3s(transform->worldToIndex(vertex));
     const openvdb::tools::QuadAndTriangleDataAdapter<openvdb::Vec3s, openvdb::Vec3I> mesh(vertices, faces);
-    return wrap(openvdb::tools::meshToVolume<openvdb::FloatGrid>(
-        mesh, *transform, half_width, half_width, openvdb::tools::DISABLE_RENORMALIZATION));
+    return wrap(openvdb::tools::meshToVolume<openvdb::FloatGrid>(mesh, *transform, half_width, half_width,
+        openvdb::tools::DISABLE_RENORMALIZATION | openvdb::tools::DISABLE_INTERSECTING_VOXEL_REMOVAL));
 }
 
 struct RawMesh::Impl {

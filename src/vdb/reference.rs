@@ -121,7 +121,8 @@ impl ReferenceGrid {
         Self::converted(points, triangles, transform, half_width, true)
     }
 
-    /// As [`from_mesh`](Self::from_mesh), without the renormalisation that it ends with (`DISABLE_RENORMALIZATION`).
+    /// As [`from_mesh`](Self::from_mesh), without what it does to the distances in the end (`DISABLE_RENORMALIZATION`,
+    /// `DISABLE_INTERSECTING_VOXEL_REMOVAL`).
     pub fn from_mesh_unnormalized(
         points: &[Vec3],
         triangles: &[[u32; 3]],

@@ -10,7 +10,7 @@
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 
-use crate::grid::LeafMask;
+use crate::grid::{LeafMask, leaf_origin};
 use crate::mesh::bins::{Bins, ceil, ceil1, floor};
 
 /// Columns along the edge of a tile: the unit of parallel work.
@@ -32,12 +32,13 @@ struct Tile {
     key: [i32; 2],
     starts: Vec<u32>,
     crossings: Vec<Crossing>,
-    overlaps: u64,
+    overlaps: Vec<IVec3>,
 }
 
 /// The crossings of all rows in z with a closed mesh.
 pub(super) struct Crossings {
     tiles: Vec<Tile>,
+    overlaps: Vec<IVec3>,
 }
 
 impl Crossings {
@@ -51,41 +52,57 @@ impl Crossings {
             }
         });
         let tile = |bin| scan_tile(*bins.key(bin), bins.items(bin), &triangle);
-        Self { tiles: (0..bins.len()).into_par_iter().filter_map(tile).collect() }
+        let mut tiles: Vec<Tile> = (0..bins.len()).into_par_iter().filter_map(tile).collect();
+        let overlaps = tiles.iter_mut().flat_map(|tile| std::mem::take(&mut tile.overlaps)).collect();
+        Self { tiles, overlaps }
     }
 
-    /// Number of places where a row passes between levels other than 0 and 1: parts of the surface lie inside each other
-    /// or face the wrong way.
-    pub fn overlaps(&self) -> u64 {
-        self.tiles.iter().map(|t| t.overlaps).sum()
+    /// Leaves where a row passes to or from levels other than 0 and 1: parts of the surface lie inside each other or
+    /// face the wrong way.
+    pub fn overlaps(&self) -> &[IVec3] {
+        &self.overlaps
+    }
+
+    /// The winding number of a voxel.
+    pub fn level(&self, ijk: IVec3) -> i32 {
+        let key = [ijk.x.div_euclid(TILE), ijk.y.div_euclid(TILE)];
+        let Ok(found) = self.tiles.binary_search_by_key(&key, |t| t.key) else { return 0 };
+        self.tiles[found].row(ijk.x, ijk.y).iter().take_while(|c| c.first <= ijk.z).map(|c| c.step).sum()
     }
 
     /// Which voxels of the leaf at `origin` have a winding number of 1 or more.
     pub fn inside(&self, origin: IVec3) -> LeafMask {
+        self.at_least(origin, 1)
+    }
+
+    /// Which voxels of the leaf at `origin` have a winding number of at least `least`.
+    pub fn at_least(&self, origin: IVec3, least: i32) -> LeafMask {
         let mut mask = LeafMask::EMPTY;
         let key = [origin.x.div_euclid(TILE), origin.y.div_euclid(TILE)];
-        let Ok(found) = self.tiles.binary_search_by_key(&key, |t| t.key) else { return mask };
+        let Ok(found) = self.tiles.binary_search_by_key(&key, |t| t.key) else {
+            return if least > 0 { mask } else { LeafMask::FULL };
+        };
         let tile = &self.tiles[found];
         for (x, word) in (origin.x..).zip(&mut mask.0) {
             for (y, shift) in (origin.y..).zip((0..64).step_by(8)) {
-                *word |= u64::from(inside_row(tile.row(x, y), origin.z)) << shift;
+                *word |= u64::from(at_least_in_row(tile.row(x, y), origin.z, least)) << shift;
             }
         }
         mask
     }
 }
 
-/// A bit for each of eight voxels from `start`, set where the winding number is 1 or more.
-fn inside_row(row: &[Crossing], start: i32) -> u8 {
-    let (mut level, mut inside) = (0, 0u8);
+/// A bit for each of eight voxels from `start`, set where the winding number is at least `least`.
+fn at_least_in_row(row: &[Crossing], start: i32, least: i32) -> u8 {
+    let (mut level, mut inside) = (0, if least > 0 { 0u8 } else { 0xff });
     for crossing in row {
         let above = crossing.first.saturating_sub(start);
         if above >= 8 {
             break;
         }
-        let was = level >= 1;
+        let was = level >= least;
         level += crossing.step;
-        if was != (level >= 1) {
+        if was != (level >= least) {
             // All from here up change.
             inside ^= 0xff << above.max(0);
         }
@@ -128,16 +145,22 @@ fn scan_tile(key: [i32; 2], triangles: &[u32], triangle: &impl Fn(usize) -> [DVe
         by_row[*at as usize] = *f;
         *at += 1;
     }
-    let mut overlaps = 0;
+    let mut overlaps = Vec::new();
     for row in by_row.chunk_by_mut(|a, b| a.row == b.row) {
         row.sort_unstable_by(|a, b| a.height.total_cmp(&b.height).then(a.step.cmp(&b.step)));
         let mut level = 0;
         for (i, f) in row.iter().enumerate() {
             level += f.step;
             let settled = row.get(i + 1).is_none_or(|next| next.height - f.height > COINCIDENT);
-            overlaps += u64::from(settled && !(0..=1).contains(&level));
+            if settled && !(0..=1).contains(&level) {
+                let [x, y] = [f.row as i32 / TILE + key[0] * TILE, f.row as i32 % TILE + key[1] * TILE];
+                let ends = [Some(f), row.get(i + 1)].into_iter().flatten();
+                overlaps.extend(ends.map(|f| leaf_origin(IVec3::new(x, y, ceil1(f.height)))));
+            }
         }
     }
+    overlaps.sort_unstable_by_key(IVec3::to_array);
+    overlaps.dedup();
     let crossings = by_row.iter().map(|f| Crossing { first: ceil1(f.height), step: f.step }).collect();
     Some(Tile { key, starts, crossings, overlaps })
 }
@@ -195,7 +218,7 @@ mod tests {
     fn faces_edges_and_corners_on_voxels_are_counted_once() {
         // Every face, edge and corner of this cube lies on voxels.
         let cube = crossings(&cube(DVec3::splat(-3.0), 8.0));
-        assert_eq!(cube.overlaps(), 0);
+        assert!(cube.overlaps().is_empty());
         let count = (-8..8).flat_map(|x| (-8..8).flat_map(move |y| (-8..8).map(move |z| IVec3::new(x, y, z))));
         // Half-open: each of the 8 unit intervals of an axis holds one voxel.
         assert_eq!(count.filter(|&ijk| inside(&cube, ijk)).count(), 512);
@@ -227,11 +250,11 @@ mod tests {
     fn overlaps_and_wrong_sides_are_noticed_cavities_are_not() {
         let a = cube(DVec3::splat(0.5), 6.0);
         let overlapping = crossings(&joined(a.clone(), &cube(DVec3::splat(2.5), 9.0)));
-        assert!(overlapping.overlaps() > 0 && inside(&overlapping, IVec3::splat(4)));
-        assert!(crossings(&reversed(a.clone())).overlaps() > 0);
+        assert!(!overlapping.overlaps().is_empty() && inside(&overlapping, IVec3::splat(4)));
+        assert!(!crossings(&reversed(a.clone())).overlaps().is_empty());
         let hollow = crossings(&joined(a.clone(), &reversed(cube(DVec3::splat(2.5), 2.0))));
-        assert!(hollow.overlaps() == 0 && !inside(&hollow, IVec3::splat(4)) && inside(&hollow, IVec3::splat(2)));
+        assert!(hollow.overlaps().is_empty() && !inside(&hollow, IVec3::splat(4)) && inside(&hollow, IVec3::splat(2)));
         // Shells that touch in a plane are no overlap.
-        assert_eq!(crossings(&joined(a, &cube(DVec3::new(0.5, 0.5, 6.5), 6.0))).overlaps(), 0);
+        assert!(crossings(&joined(a, &cube(DVec3::new(0.5, 0.5, 6.5), 6.0))).overlaps().is_empty());
     }
 }

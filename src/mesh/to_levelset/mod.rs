@@ -13,22 +13,26 @@ mod crossings;
 mod inside;
 mod intersect;
 mod pieces;
+mod rim;
 
 use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
-use glam::DVec3;
+use glam::{DVec3, IVec3};
 use rayon::prelude::*;
+use rustc_hash::FxHashSet;
 
 use closure::{DistanceLeaves, Surroundings};
 use crossings::Crossings;
-use inside::{Inside, OpenInside, Rim};
+use inside::{Inside, caps};
 use pieces::separating_pieces;
+use rim::Rim;
 
+use super::bins::{Bins, floor};
 use super::prepare::prepare;
 use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes, leaves_near_triangles};
 use super::topology::{boundary_chain, edge_uses};
-use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber};
+use super::{Bvh, MeshFindings, TriangleMesh};
 use crate::error::{EditError, Result};
-use crate::grid::{LEAF_VOXELS, LeafMask, LeafValues, MAX_COORD, Transform, VOXEL_SIZES};
+use crate::grid::{LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, MAX_COORD, Transform, VOXEL_SIZES};
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, background, grid_of_parts};
 use crate::run::RunOptions;
 use crate::stencil::simd::{Lanes, Work, dispatch};
@@ -96,21 +100,34 @@ pub fn mesh_to_level_set(
 
     let corners = |t: usize| clean.corners(t);
     let count = clean.triangles.len();
-    let closed = findings.converted.closed || boundary_chain(&edge_uses(&clean.triangles)).is_empty();
-    let crossings = closed.then(|| Crossings::new(count, corners));
-    findings.self_intersecting = crossings.as_ref().is_some_and(|c| c.overlaps() > 0 || overlaps_sideways(&clean));
+    let chain = match findings.converted.closed {
+        true => Vec::new(),
+        false => boundary_chain(&edge_uses(&clean.triangles)),
+    };
+    let caps = caps(&clean.positions, &chain);
+    // The crossings of a closed surface.
+    let with_caps = |t: usize| caps.get(t.wrapping_sub(count)).copied().unwrap_or_else(|| corners(t));
+    let crossings = Crossings::new(count + caps.len(), with_caps);
+    run.check(OPERATION)?;
+    let mut overlaps = crossings.overlaps().to_vec();
+    overlaps.extend(overlaps_sideways(count + caps.len(), with_caps));
+    run.check(OPERATION)?;
+    let closed = chain.is_empty();
+    findings.self_intersecting = closed && !overlaps.is_empty();
     if params.strict && !findings.is_sound() {
         return Err(EditError::input("mesh", format!("refused (strict): {}", findings.warnings().join("; "))));
     }
     let transform = Transform::uniform(params.voxel_size);
     let background = background(params.half_width, &transform);
-    let leaves = match crossings {
-        Some(crossings) if !findings.self_intersecting => {
-            leaves_near_triangles(count, corners, params.half_width, run, |origin, distance| {
-                signed(origin, distance, &crossings.inside(origin), params.voxel_size, background)
-            })?
-        }
-        crossings => vec![repair(&clean, crossings, params, &mut findings, run)?],
+    let leaves = if closed && overlaps.is_empty() {
+        leaves_near_triangles(count, corners, params.half_width, run, |origin, distance| {
+            signed(origin, distance, &crossings.inside(origin), params.voxel_size, background)
+        })?
+    } else {
+        let caps = Bvh::new(caps);
+        let rim = Rim::new(&clean.positions, &chain);
+        let doubts = Doubts { inside: Inside::new(crossings, &caps, &rim), overlaps, rim: &rim };
+        vec![repair(&clean, &doubts, params, &mut findings, run)?]
     };
     let level_set = LevelSet::new(grid_of_parts(background, leaves), transform);
     if !encloses_a_voxel(&level_set) {
@@ -119,36 +136,71 @@ pub fn mesh_to_level_set(
     Ok((level_set, findings))
 }
 
+/// What is known of a surface that overlaps itself or is open.
+struct Doubts<'a> {
+    inside: Inside<'a>,
+    /// Leaves where it overlaps itself.
+    overlaps: Vec<IVec3>,
+    rim: &'a Rim,
+}
+
+impl Doubts<'_> {
+    /// Marks the triangles near which the winding number may be other than 0 on one side and 1 on the other.
+    fn triangles(&self, mesh: &TriangleMesh) -> Vec<bool> {
+        let around = (0..27).map(|i| IVec3::new(i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1) * LEAF_DIM);
+        let overlaps: FxHashSet<IVec3> =
+            around.flat_map(|step| self.overlaps.iter().map(move |origin| *origin + step)).collect();
+        let bins = leaf_bins(mesh.triangles.len(), |t| mesh.corners(t), 0.0);
+        let doubtful = |bin: &usize| {
+            let origin = IVec3::from_array(*bins.key(*bin)) * LEAF_DIM;
+            overlaps.contains(&origin) || !self.inside.is_integer(origin, LEAF_DIM + 1)
+        };
+        let mut marks = vec![false; mesh.triangles.len()];
+        let leaves: Vec<usize> = (0..bins.len()).into_par_iter().filter(doubtful).collect();
+        leaves.into_iter().flat_map(|bin| bins.items(bin)).for_each(|&t| marks[t as usize] = true);
+        marks
+    }
+}
+
+/// The triangles by the leaves that their boxes touch, widened by `reach` voxels.
+fn leaf_bins(count: usize, triangle: impl Fn(usize) -> [DVec3; 3] + Sync, reach: f64) -> Bins<[i32; 3]> {
+    Bins::new(count, |t, leaves: &mut Vec<[i32; 3]>| {
+        let [a, b, c] = triangle(t);
+        let leaf = |p: IVec3| IVec3::new(p.x >> 3, p.y >> 3, p.z >> 3);
+        let (lo, hi) = (leaf(floor(a.min(b).min(c) - reach)), leaf(floor(a.max(b).max(c) + reach)));
+        for x in lo.x..=hi.x {
+            for y in lo.y..=hi.y {
+                leaves.extend((lo.z..=hi.z).map(|z| [x, y, z]));
+            }
+        }
+    })
+}
+
 /// Signed leaves of a surface that overlaps itself or is open.
 fn repair(
     clean: &TriangleMesh,
-    crossings: Option<Crossings>,
+    doubts: &Doubts<'_>,
     params: &MeshToLevelSet,
     findings: &mut MeshFindings,
     run: &RunOptions,
 ) -> Result<Vec<SignedLeaf>> {
     let half_width = params.half_width;
-    let distances = distance_to_triangles(clean.triangles.len(), |t| clean.corners(t), half_width, run)?;
-    let bvh = Bvh::new((0..clean.triangles.len()).map(|t| clean.corners(t)).collect());
-    let winding = WindingNumber::new(&bvh);
-    let rim = Rim::new(&clean.positions, &clean.triangles);
-    let inside = match crossings {
-        Some(crossings) => Inside::Closed(crossings),
-        None => Inside::Open(OpenInside { winding: &winding, rim: &rim }),
-    };
+    let doubtful = doubts.triangles(clean);
     run.check(OPERATION)?;
-    let pieces = separating_pieces(&clean.positions, &clean.triangles, &bvh, &winding, &rim, run)?;
+    let pieces = separating_pieces(&clean.positions, &clean.triangles, &doubtful, doubts.rim, run)?;
     findings.removed_area_fraction = pieces.removed_area_fraction;
     run.check(OPERATION)?;
-    let all = DistanceLeaves::new(distances);
-    let kept = if pieces.removed_area_fraction > 0.0 {
-        distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?
+    let mut kept = DistanceLeaves::new(distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?);
+    // The surface may go on where triangles were left out.
+    let suspects: Vec<IVec3> = if pieces.removed_area_fraction > 0.0 {
+        let marked: Vec<usize> = (0..doubtful.len()).filter(|&t| doubtful[t]).collect();
+        let bins = leaf_bins(marked.len(), |i| clean.corners(marked[i]), 1.0);
+        (0..bins.len()).map(|bin| IVec3::from_array(*bins.key(bin)) * LEAF_DIM).collect()
     } else {
-        all.leaves().to_vec()
+        Vec::new()
     };
-    let mut kept = DistanceLeaves::new(kept);
-    let mut surroundings = Surroundings::new(&inside, &winding, &all);
-    let closure = surroundings.close(&kept, half_width, run)?;
+    let mut surroundings = Surroundings::new(&doubts.inside);
+    let closure = surroundings.close(&kept, &suspects, half_width, run)?;
     findings.closure_triangles = closure.len();
     kept.merge(distance_to_triangles(closure.len(), |t| closure[t], half_width, run)?);
     let unsigned: Vec<_> = kept.origins().filter(|o| surroundings.mask(*o).is_none()).collect();
@@ -162,12 +214,12 @@ fn repair(
 }
 
 /// Values and mask of a leaf at its origin.
-type SignedLeaf = (glam::IVec3, LeafValues, LeafMask);
+type SignedLeaf = (IVec3, LeafValues, LeafMask);
 
 /// World-space signed distances and active mask from distances in voxels and the inside of a leaf; `None` where none is in
 /// the band.
 fn signed(
-    origin: glam::IVec3,
+    origin: IVec3,
     distance: &LeafValues,
     inside: &LeafMask,
     voxel_size: f64,
@@ -264,13 +316,14 @@ fn reserve(mesh: &TriangleMesh, params: &MeshToLevelSet, run: &RunOptions) -> Re
     run.reserve(OPERATION, needed, "take a larger voxel_size")
 }
 
-/// Whether rows along x or y find an overlap that rows along z have missed, being thin and upright.
-fn overlaps_sideways(mesh: &TriangleMesh) -> bool {
-    let turned = |t: usize, turn: fn(DVec3) -> DVec3| mesh.corners(t).map(turn);
-    let count = mesh.triangles.len();
+/// Leaves where rows along x or y find overlaps, which rows along z miss in what is thin and upright.
+fn overlaps_sideways(count: usize, triangle: impl Fn(usize) -> [DVec3; 3] + Sync) -> Vec<IVec3> {
     // Cyclic permutations keep the orientation.
-    Crossings::new(count, |t| turned(t, |p| DVec3::new(p.y, p.z, p.x))).overlaps() > 0
-        || Crossings::new(count, |t| turned(t, |p| DVec3::new(p.z, p.x, p.y))).overlaps() > 0
+    let along_x = Crossings::new(count, |t| triangle(t).map(|p| DVec3::new(p.y, p.z, p.x)));
+    let along_y = Crossings::new(count, |t| triangle(t).map(|p| DVec3::new(p.z, p.x, p.y)));
+    let back_x = along_x.overlaps().iter().map(|o| IVec3::new(o.z, o.x, o.y));
+    let back_y = along_y.overlaps().iter().map(|o| IVec3::new(o.y, o.z, o.x));
+    back_x.chain(back_y).collect()
 }
 
 fn encloses_a_voxel(level_set: &LevelSet) -> bool {
