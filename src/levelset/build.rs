@@ -14,7 +14,7 @@ const LARGEST_BLOCK: i32 = 1 << 30;
 const OPERATION: &str = "sampling a distance function";
 
 /// Bytes that a leaf costs while it is built: its values twice (collected, then in pages), mask and tables.
-const BYTES_A_LEAF: u64 = 2 * 2048 + 512;
+pub(crate) const BYTES_A_LEAF: u64 = 2 * 2048 + 512;
 
 impl LevelSet {
     /// The level set of a signed distance function given in **index space and voxels**: `distance(ijk)` is negative inside,
@@ -62,15 +62,15 @@ impl LevelSet {
     }
 }
 
-/// A grid of the given leaves, in any order; the signs of the space between are flooded from them.
+/// A grid of the given leaves, sorted here; the signs of the space between are flooded from them.
 pub(crate) fn grid_of_leaves(background: f32, leaves: Vec<(IVec3, LeafValues, LeafMask)>) -> Grid {
-    grid_of_parts(background, vec![leaves])
+    grid_of_parts(background, &[leaves])
 }
 
-/// [`grid_of_leaves`] of several lists together: what parallel tasks made need not be moved into one.
-pub(crate) fn grid_of_parts(background: f32, parts: Vec<Vec<(IVec3, LeafValues, LeafMask)>>) -> Grid {
-    // References are sorted, not leaves of two kilobytes.
-    let mut leaves: Vec<&(IVec3, LeafValues, LeafMask)> = parts.iter().flatten().collect();
+/// As [`grid_of_leaves`], from the parts that several tasks made.
+pub(crate) fn grid_of_parts(background: f32, parts: &[Vec<(IVec3, LeafValues, LeafMask)>]) -> Grid {
+    // Two kilobytes a leaf stay where they are until they are copied into pages.
+    let mut leaves: Vec<_> = parts.iter().flatten().collect();
     leaves.par_sort_unstable_by_key(|(o, ..)| (o.x, o.y, o.z));
     let origins: Vec<IVec3> = leaves.iter().map(|l| l.0).collect();
     let mut grid = Grid::from_origins(background, &origins);

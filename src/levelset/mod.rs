@@ -20,7 +20,7 @@ mod violation;
 
 use glam::{DVec3, IVec3};
 
-pub(crate) use build::{grid_of_leaves, grid_of_parts};
+pub(crate) use build::{BYTES_A_LEAF, grid_of_leaves, grid_of_parts};
 pub use components::Components;
 pub use measure::Measures;
 pub use sample::Sampler;

@@ -121,7 +121,7 @@ pub fn mesh_to_level_set(
     let background = background(params.half_width, &transform);
     let leaves = if closed && overlaps.is_empty() {
         leaves_near_triangles(count, corners, params.half_width, run, |origin, distance| {
-            signed(origin, distance, &crossings.inside(origin), params.voxel_size, background)
+            signed(origin, distance, &crossings.inside(origin), params)
         })?
     } else {
         let caps = Bvh::new(caps);
@@ -129,7 +129,7 @@ pub fn mesh_to_level_set(
         let doubts = Doubts { inside: Inside::new(crossings, &caps, &rim), overlaps, rim: &rim };
         vec![repair(&clean, &doubts, params, &mut findings, run)?]
     };
-    let level_set = LevelSet::new(grid_of_parts(background, leaves), transform);
+    let level_set = LevelSet::new(grid_of_parts(background, &leaves), transform);
     if !encloses_a_voxel(&level_set) {
         return Err(encloses_nothing(closed, &findings, params));
     }
@@ -205,10 +205,8 @@ fn repair(
     kept.merge(distance_to_triangles(closure.len(), |t| closure[t], half_width, run)?);
     let unsigned: Vec<_> = kept.origins().filter(|o| surroundings.mask(*o).is_none()).collect();
     surroundings.extend(&unsigned);
-    let background = background(half_width, &Transform::uniform(params.voxel_size));
     let signed = |leaf: &UnsignedLeaf| {
-        let inside = surroundings.mask(leaf.origin).copied().unwrap_or_default();
-        signed(leaf.origin, &leaf.distance, &inside, params.voxel_size, background)
+        signed(leaf.origin, &leaf.distance, &surroundings.mask(leaf.origin).copied().unwrap_or_default(), params)
     };
     Ok(kept.leaves().par_iter().filter_map(signed).collect())
 }
@@ -218,16 +216,12 @@ type SignedLeaf = (IVec3, LeafValues, LeafMask);
 
 /// World-space signed distances and active mask from distances in voxels and the inside of a leaf; `None` where none is in
 /// the band.
-fn signed(
-    origin: IVec3,
-    distance: &LeafValues,
-    inside: &LeafMask,
-    voxel_size: f64,
-    background: f32,
-) -> Option<SignedLeaf> {
+fn signed(origin: IVec3, distance: &LeafValues, inside: &LeafMask, params: &MeshToLevelSet) -> Option<SignedLeaf> {
     let mut leaf = (origin, LeafValues::default(), LeafMask::EMPTY);
     let (_, values, active) = &mut leaf;
-    dispatch(Sign { distance, inside, voxel_size: voxel_size as f32, background, values, active });
+    let &MeshToLevelSet { voxel_size, half_width, .. } = params;
+    let background = background(half_width, &Transform::uniform(voxel_size));
+    dispatch(Sign { distance, inside, voxel_size: voxel_size as f32, half_width, background, values, active });
     (!leaf.2.is_empty()).then_some(leaf)
 }
 
@@ -236,6 +230,7 @@ struct Sign<'a> {
     distance: &'a LeafValues,
     inside: &'a LeafMask,
     voxel_size: f32,
+    half_width: f32,
     background: f32,
     values: &'a mut LeafValues,
     active: &'a mut LeafMask,
@@ -246,8 +241,10 @@ impl Work for Sign<'_> {
     fn run<S: Simd>(self, simd: S) {
         for at in (0..LEAF_VOXELS).step_by(16) {
             let (word, shift) = (at / 64, at % 64);
-            let phi = Lanes::from_slice(simd, &self.distance.0[at..at + 16]) * self.voxel_size;
-            let active = phi.simd_lt(self.background);
+            let distance = Lanes::from_slice(simd, &self.distance.0[at..at + 16]);
+            let phi = distance * self.voxel_size;
+            // Either alone would not do: the background is rounded otherwise than products with the voxel size.
+            let active = distance.simd_lt(self.half_width) & phi.simd_lt(self.background);
             self.active.0[word] |= active.to_bitmask() << shift;
             let magnitude = active.select(phi, Lanes::splat(simd, self.background));
             let inside = mask32x16::from_bitmask(simd, self.inside.0[word] >> shift & 0xffff);
