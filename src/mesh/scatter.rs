@@ -74,11 +74,7 @@ pub(crate) fn leaves_near_triangles<R: Send>(
     run: &RunOptions,
     leaf: impl Fn(IVec3, &LeafValues) -> Option<R> + Sync,
 ) -> Result<Vec<Vec<R>>> {
-    let bins = Bins::new(count, |t, tiles: &mut Vec<[i32; 3]>| {
-        let corners = triangle(t);
-        let (lo, hi) = tile_range(corners, f64::from(half_width));
-        add_tiles(tiles, corners, f64::from(half_width), lo, hi);
-    });
+    let bins = Bins::new(count, |t, tiles| tiles_near(tiles, triangle(t), f64::from(half_width), TILE));
     run.check(OPERATION)?;
     let task = run.task("distances", bins.len() as u64);
     let per_tile: Vec<Vec<R>> = (0..bins.len())
@@ -113,14 +109,15 @@ pub(crate) fn leaves_near_triangles<R: Send>(
 
 const OPERATION: &str = "mesh to level set";
 
-/// The tiles that the box of a triangle and its band touches, both ends included.
-fn tile_range([a, b, c]: [DVec3; 3], half_width: f64) -> (IVec3, IVec3) {
-    let tile = |p: IVec3| IVec3::new(p.x.div_euclid(TILE), p.y.div_euclid(TILE), p.z.div_euclid(TILE));
-    (tile(ceil(a.min(b).min(c) - half_width)), tile(floor(a.max(b).max(c) + half_width)))
+/// Adds the tiles of `edge` voxels that hold a voxel within `reach` of a triangle, and perhaps some more.
+pub(crate) fn tiles_near(tiles: &mut Vec<[i32; 3]>, [a, b, c]: [DVec3; 3], reach: f64, edge: i32) {
+    let tile = |p: IVec3| IVec3::new(p.x.div_euclid(edge), p.y.div_euclid(edge), p.z.div_euclid(edge));
+    let (lo, hi) = (tile(ceil(a.min(b).min(c) - reach)), tile(floor(a.max(b).max(c) + reach)));
+    add_tiles(tiles, [a, b, c], reach, edge, lo, hi);
 }
 
-/// Adds the tiles of a range that the band of a triangle touches, halving the range as long as it is large.
-fn add_tiles(tiles: &mut Vec<[i32; 3]>, corners: [DVec3; 3], half_width: f64, lo: IVec3, hi: IVec3) {
+/// Adds the tiles of a range that a triangle comes near to, halving the range as long as it is large.
+fn add_tiles(tiles: &mut Vec<[i32; 3]>, corners: [DVec3; 3], reach: f64, edge: i32, lo: IVec3, hi: IVec3) {
     let size = hi - lo + 1;
     // Up to here the exact test costs more than the tiles that it saves.
     if size.max_element() <= 2 {
@@ -131,9 +128,9 @@ fn add_tiles(tiles: &mut Vec<[i32; 3]>, corners: [DVec3; 3], half_width: f64, lo
         }
         return;
     }
-    let center = (lo + hi + 1).as_dvec3() * (0.5 * TILE as f64);
-    let reach = 0.5 * size.as_dvec3().length() * TILE as f64 + half_width;
-    if closest_on_triangle(center, corners).distance_squared(center) > reach * reach {
+    let center = (lo + hi + 1).as_dvec3() * (0.5 * f64::from(edge));
+    let range = 0.5 * size.as_dvec3().length() * f64::from(edge) + reach;
+    if closest_on_triangle(center, corners).distance_squared(center) > range * range {
         return;
     }
     let axis = if size.x >= size.y && size.x >= size.z {
@@ -146,8 +143,8 @@ fn add_tiles(tiles: &mut Vec<[i32; 3]>, corners: [DVec3; 3], half_width: f64, lo
     let (mut low_end, mut high_start) = (hi, lo);
     low_end[axis] = lo[axis] + size[axis] / 2 - 1;
     high_start[axis] = low_end[axis] + 1;
-    add_tiles(tiles, corners, half_width, lo, low_end);
-    add_tiles(tiles, corners, half_width, high_start, hi);
+    add_tiles(tiles, corners, reach, edge, lo, low_end);
+    add_tiles(tiles, corners, reach, edge, high_start, hi);
 }
 
 /// Lowers the squared distances of one tile by all of its triangles.
@@ -174,7 +171,7 @@ impl<T: Fn(usize) -> [DVec3; 3]> Work for LowerTile<'_, T> {
             // Voxels of the tile in the box of the triangle and its band.
             let lo = ceil((bounds.0 - reach).max(DVec3::ZERO));
             let hi = floor((bounds.1 + reach).min(DVec3::splat(f64::from(TILE - 1))));
-            let blocks = (hi - lo + BLOCK) / BLOCK;
+            let blocks = ((hi - lo + BLOCK) / BLOCK).max(IVec3::ZERO);
             for block in 0..blocks.x * blocks.y * blocks.z {
                 let at = IVec3::new(block / (blocks.y * blocks.z), block / blocks.z % blocks.y, block % blocks.z);
                 let start = lo + (hi + 1 - lo) * at / blocks;

@@ -26,9 +26,9 @@ use inside::{Inside, caps};
 use pieces::separating_pieces;
 use rim::Rim;
 
-use super::bins::{Bins, floor};
+use super::bins::Bins;
 use super::prepare::prepare;
-use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes, leaves_near_triangles};
+use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes, leaves_near_triangles, tiles_near};
 use super::topology::{boundary_chain, edge_uses};
 use super::{Bvh, MeshFindings, TriangleMesh};
 use crate::error::{EditError, Result};
@@ -150,7 +150,7 @@ impl Doubts<'_> {
         let around = (0..27).map(|i| IVec3::new(i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1) * LEAF_DIM);
         let overlaps: FxHashSet<IVec3> =
             around.flat_map(|step| self.overlaps.iter().map(move |origin| *origin + step)).collect();
-        let bins = leaf_bins(mesh.triangles.len(), |t| mesh.corners(t), 0.0);
+        let bins = Bins::new(mesh.triangles.len(), |t, leaves| tiles_near(leaves, mesh.corners(t), 1.0, LEAF_DIM));
         let doubtful = |bin: &usize| {
             let origin = IVec3::from_array(*bins.key(*bin)) * LEAF_DIM;
             overlaps.contains(&origin) || !self.inside.is_integer(origin, LEAF_DIM + 1)
@@ -160,20 +160,6 @@ impl Doubts<'_> {
         leaves.into_iter().flat_map(|bin| bins.items(bin)).for_each(|&t| marks[t as usize] = true);
         marks
     }
-}
-
-/// The triangles by the leaves that their boxes touch, widened by `reach` voxels.
-fn leaf_bins(count: usize, triangle: impl Fn(usize) -> [DVec3; 3] + Sync, reach: f64) -> Bins<[i32; 3]> {
-    Bins::new(count, |t, leaves: &mut Vec<[i32; 3]>| {
-        let [a, b, c] = triangle(t);
-        let leaf = |p: IVec3| IVec3::new(p.x >> 3, p.y >> 3, p.z >> 3);
-        let (lo, hi) = (leaf(floor(a.min(b).min(c) - reach)), leaf(floor(a.max(b).max(c) + reach)));
-        for x in lo.x..=hi.x {
-            for y in lo.y..=hi.y {
-                leaves.extend((lo.z..=hi.z).map(|z| [x, y, z]));
-            }
-        }
-    })
 }
 
 /// Signed leaves of a surface that overlaps itself or is open.
@@ -194,7 +180,7 @@ fn repair(
     // The surface may go on where triangles were left out.
     let suspects: Vec<IVec3> = if pieces.removed_area_fraction > 0.0 {
         let marked: Vec<usize> = (0..doubtful.len()).filter(|&t| doubtful[t]).collect();
-        let bins = leaf_bins(marked.len(), |i| clean.corners(marked[i]), 1.0);
+        let bins = Bins::new(marked.len(), |i, leaves| tiles_near(leaves, clean.corners(marked[i]), 1.0, LEAF_DIM));
         (0..bins.len()).map(|bin| IVec3::from_array(*bins.key(bin)) * LEAF_DIM).collect()
     } else {
         Vec::new()
