@@ -2,6 +2,8 @@
 
 use std::time::Instant;
 
+use glam::IVec3;
+
 use super::Input;
 use super::difference::{Difference, bvh};
 use crate::error::Result;
@@ -59,6 +61,8 @@ pub(super) enum Judge {
     /// Both against the mesh (in index space) that they were made of, and voxel by voxel where both have one sign: above this
     /// tolerance in voxels they count as apart.
     Mesh { mesh: TriangleMesh, tolerance: f64 },
+    /// Voxel by voxel where this holds.
+    EqualAt(Box<dyn Fn(IVec3) -> bool>),
     /// Both against the distance to the polygonised input, less this offset (in voxels).
     Truth { offset: f64 },
 }
@@ -110,6 +114,7 @@ impl Contest for GridContest<'_> {
             Judge::Mesh { mesh, tolerance } => {
                 Difference::to_mesh(ours, &theirs, &bvh(mesh, &Transform::uniform(1.0)), *tolerance)
             }
+            Judge::EqualAt(counts) => Difference::between(ours, &theirs, |ijk, _, _| counts(ijk)),
             Judge::Truth { offset } => {
                 Difference::to_truth(ours, &theirs, self.input.truth()?, self.input.level_set, *offset)
             }
@@ -117,11 +122,9 @@ impl Contest for GridContest<'_> {
     }
 }
 
-/// A copy that shares no page with the original, as OpenVDB's deep copy.
+/// A copy that shares nothing with the original, as OpenVDB's deep copy.
 fn unshared(level_set: &LevelSet) -> LevelSet {
-    let mut copy = level_set.clone();
-    copy.grid_mut().update_all(|_, _, _| ());
-    copy
+    LevelSet::new(level_set.grid().deep_copy(), *level_set.transform())
 }
 
 /// The result of `f` and the milliseconds it took.

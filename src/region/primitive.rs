@@ -58,6 +58,17 @@ impl Shape {
         }
     }
 
+    /// Radius of a ball around the centre that lies in the shape: s changes by at most 1/radius a unit of length.
+    fn inner_radius(&self) -> f64 {
+        match *self {
+            Self::Sphere { radius } => radius,
+            Self::Box { half_size } => half_size.min_element(),
+            Self::Cylinder { radius, half_height } => radius.min(half_height),
+            // Exponents up to 2: the octahedron with the semi-axes lies in it.
+            Self::Superellipsoid { radii, .. } => 1.0 / radii.recip().length(),
+        }
+    }
+
     /// Half edges of the local box around the shape.
     fn extent(&self) -> DVec3 {
         match *self {
@@ -126,6 +137,58 @@ impl Region for Primitive {
         let reach = abs * extent;
         Some((self.centre - reach, self.centre + reach))
     }
+
+    fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
+        // s is the gauge of a convex body, so that it changes by at most one over the radius of a ball within. A little more for rounding.
+        let reach = radius / self.shape.inner_radius() * (1.0 + 1e-9) + 1e-9;
+        let s = self.shape.size_fraction(self.axes.transpose() * (centre - self.centre));
+        [f32::from(u8::from(s + reach < self.soft[0])), f32::from(u8::from(s - reach < self.soft[1]))]
+    }
+}
+
+/// One side of a plane: α = P(−f; 0, depth) with f = (x − point)·normal, 0 on the plane and 1 from `depth` behind it on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HalfSpace {
+    point: DVec3,
+    normal: DVec3,
+    depth: f64,
+}
+
+impl HalfSpace {
+    /// The side of the plane through `point` that `normal` points away from, full at `depth` (world units) behind it.
+    pub fn new(point: DVec3, normal: DVec3, depth: f64) -> Result<Self> {
+        let refuse =
+            |field: &str, value: String, accepted: &str| EditError::parameter("region", field, value, accepted);
+        let unit = normal.try_normalize().filter(|n| n.is_finite());
+        let unit = unit.ok_or_else(|| refuse("normal", normal.to_string(), "a finite vector that is not zero"))?;
+        if !point.is_finite() {
+            return Err(refuse("point", point.to_string(), "three finite numbers"));
+        }
+        if !(depth >= 0.0 && depth.is_finite()) {
+            return Err(refuse("soft", depth.to_string(), "a finite number of voxels, 0 or more"));
+        }
+        Ok(Self { point, normal: unit, depth })
+    }
+
+    /// −f: how far a position lies inside.
+    fn depth_of(&self, xyz: DVec3) -> f64 {
+        (self.point - xyz).dot(self.normal)
+    }
+}
+
+impl Region for HalfSpace {
+    fn weight(&self, xyz: DVec3) -> f32 {
+        ramp_between(self.depth_of(xyz), 0.0, self.depth) as f32
+    }
+
+    fn bounds(&self) -> Option<(DVec3, DVec3)> {
+        None
+    }
+
+    fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
+        let depth = self.depth_of(centre);
+        [-radius, radius].map(|by| ramp_between(depth + by * (1.0 + 1e-9), 0.0, self.depth) as f32)
+    }
 }
 
 #[cfg(test)]
@@ -162,6 +225,43 @@ mod tests {
                 assert!((region.weight(axis * s) - w).abs() < 1e-6, "{region:?} {s}");
             }
         }
+    }
+
+    #[test]
+    fn no_weight_in_a_ball_is_beyond_its_limits() {
+        for shape in [
+            Shape::Sphere { radius: 2.0 },
+            Shape::Box { half_size: DVec3::new(1.0, 2.0, 3.0) },
+            Shape::Cylinder { radius: 2.0, half_height: 1.0 },
+            Shape::Superellipsoid { radii: DVec3::new(3.0, 2.0, 1.0), exponents: [0.2, 2.0] },
+            Shape::Superellipsoid { radii: DVec3::new(1.0, 1.0, 2.0), exponents: [2.0, 2.0] },
+        ] {
+            let region = at_origin(shape);
+            let at = |i: u32, k: u32| f64::from(i * k % 41) / 20.5 - 1.0;
+            let (mut all, mut none) = (0, 0);
+            for i in 0..400 {
+                let centre = DVec3::new(at(i, 7), at(i, 11), at(i, 17)) * 3.3;
+                let [low, high] = region.weights_within(centre, 0.3);
+                for k in 0..60 {
+                    let offset = DVec3::new(at(k, 3), at(k, 13), at(k, 19)).normalize_or_zero() * 0.3;
+                    assert!((low..=high).contains(&region.weight(centre + offset)), "{region:?} {centre}");
+                }
+                (all, none) = (all + u32::from(low == 1.0), none + u32::from(high == 0.0));
+            }
+            assert!(all > 0 && none > 40, "{region:?}: {all} {none}");
+        }
+    }
+
+    #[test]
+    fn half_space_is_full_behind_its_rim() {
+        let region = HalfSpace::new(DVec3::X, DVec3::X * 5.0, 2.0).unwrap();
+        for (x, w) in [(2.0, 0.0), (1.0, 0.0), (0.0, 0.5), (-1.0, 1.0), (-50.0, 1.0)] {
+            assert_eq!(region.weight(DVec3::new(x, 7.0, -3.0)), w, "{x}");
+        }
+        assert_eq!(region.weights_within(DVec3::X * 3.0, 1.5), [0.0, 0.0]);
+        assert_eq!(region.weights_within(DVec3::X * -3.0, 1.5), [1.0, 1.0]);
+        assert_eq!(region.weights_within(DVec3::ZERO, 1.5), [0.0, 1.0]);
+        assert!(HalfSpace::new(DVec3::X, DVec3::ZERO, 2.0).is_err());
     }
 
     #[test]
