@@ -34,17 +34,25 @@ mod bridge {
         // Writes the headers that the C++ files include.
         let mut bridge = cxx_build::bridge("src/vdb/bridge.rs");
         let generated = PathBuf::from(env::var_os("OUT_DIR").unwrap_or_default()).join("cxxbridge/include");
-        // Independent translation units (4, 5 and 22 s on a 2023 server core): compiled side by side. `-O3` because some
-        // loops of OpenVDB's tools are instantiated here, and comparisons with them are to be fair.
+        // Independent translation units (4, 5 and 22 s on a 2023 server core, the tools longest): compiled side by side. `-O3`
+        // because some loops of OpenVDB's tools are instantiated here, and comparisons with them are to be fair.
         std::thread::scope(|scope| {
-            let reference = scope.spawn(|| {
-                let mut build = cc::Build::new();
-                found.configure(&mut build).include(generated).opt_level(3).file("cpp/reference.cc");
-                build.cargo_metadata(false).compile("vdb_edit_reference");
+            let tools =
+                [("cpp/reference.cc", "vdb_edit_reference"), ("cpp/reference_morph.cc", "vdb_edit_reference_morph")];
+            let tools = tools.map(|(file, library)| {
+                let (found, generated) = (&found, &generated);
+                let task = scope.spawn(move || {
+                    let mut build = cc::Build::new();
+                    found.configure(&mut build).include(generated).opt_level(3).file(file);
+                    build.cargo_metadata(false).compile(library);
+                });
+                (file, task)
             });
             found.configure(&mut bridge).opt_level(3).files(["cpp/archive.cc", "cpp/grid.cc", "cpp/reference_io.cc"]);
             bridge.cargo_metadata(false).compile("vdb_edit_bridge");
-            reference.join().map_err(|_| "the compiler failed on cpp/reference.cc, see above".to_string())
+            tools.into_iter().try_for_each(|(file, task)| {
+                task.join().map_err(|_| format!("the compiler failed on {file}, see above"))
+            })
         })?;
         found.link();
         Ok(())
@@ -118,6 +126,7 @@ mod bridge {
             // The generated code calls into the reference, not the other way about, but that calls into the bridge.
             println!("cargo::rustc-link-lib=static=vdb_edit_bridge");
             println!("cargo::rustc-link-lib=static=vdb_edit_reference");
+            println!("cargo::rustc-link-lib=static=vdb_edit_reference_morph");
             for (dir, library) in &self.lib {
                 println!("cargo::rustc-link-search=native={}", dir.display());
                 println!("cargo::rustc-link-lib={library}");

@@ -14,7 +14,7 @@ use vdb_edit::run::RunOptions;
 use vdb_edit::stencil::curvature::{laplacian, mean_curvature};
 use vdb_edit::stencil::simd::{Isa, Lanes, Work, choose, dispatch};
 use vdb_edit::stencil::upwind::{WenoEpsilon, godunov_first, godunov_weno5};
-use vdb_edit::stencil::{Halo, StarHalo};
+use vdb_edit::stencil::{FaceHalo, Halo, StarHalo};
 
 fn main() {
     divan::main();
@@ -99,14 +99,22 @@ macro_rules! halo_stencil {
 
 halo_stencil!(GatherBox, gather_27_neighbours, Halo, |simd, halo, x, y, _h| halo.rows(simd, x, y, [0; 3]));
 halo_stencil!(GatherStar, gather_star_of_3, StarHalo, |simd, halo, x, y, _h| halo.centre(simd, x, y));
-halo_stencil!(Laplacian, laplacian_, Halo, |simd, halo, x, y, h| laplacian(simd, halo, x, y, h));
+halo_stencil!(GatherFaces, gather_faces, FaceHalo, |simd, halo, x, y, _h| halo.centre(simd, x, y));
+halo_stencil!(Laplacian, laplacian_, FaceHalo, |simd, halo, x, y, h| laplacian(simd, halo, x, y, h));
 halo_stencil!(Curvature, mean_curvature_, Halo, |simd, halo, x, y, h| mean_curvature(simd, halo, x, y, h).mean);
-halo_stencil!(First, godunov_first_, Halo, |simd, halo, x, y, _h| godunov_first(simd, halo, x, y));
+halo_stencil!(First, godunov_first_, FaceHalo, |simd, halo, x, y, _h| godunov_first(
+    simd,
+    halo,
+    x,
+    y,
+    halo.centre(simd, x, y)
+));
 halo_stencil!(Weno5, godunov_weno5_, StarHalo, |simd, halo, x, y, h| godunov_weno5(
     simd,
     halo,
     x,
     y,
+    halo.centre(simd, x, y),
     h,
     WenoEpsilon::SCALE_FREE
 ));
@@ -114,9 +122,5 @@ halo_stencil!(Weno5, godunov_weno5_, StarHalo, |simd, halo, x, y, h| godunov_wen
 #[divan::bench]
 fn copy_of_the_grid(bencher: Bencher) {
     let level_set = sphere();
-    bencher.counter(ItemsCount::new(level_set.grid().active_voxels())).bench_local(|| {
-        let mut copy = level_set.clone();
-        copy.grid_mut().update_all(|_, _, _| ());
-        copy
-    });
+    bencher.counter(ItemsCount::new(level_set.grid().active_voxels())).bench_local(|| level_set.grid().deep_copy());
 }

@@ -46,6 +46,7 @@ fn measure(across: u32) -> Result<()> {
     row("shape", &level_set, before, || sphere(across, &run))?;
     let one_step = |method, scheme| Smooth {
         method,
+        width: None,
         evolution: EvolutionOptions { iterations: Some(1), scheme: Some(scheme), ..EvolutionOptions::default() },
     };
     in_place("smooth, curvature, first order, one step", &level_set, |grid| {

@@ -133,6 +133,8 @@ public:
 
 /// An empty level set.
 std::unique_ptr<FloatGrid> new_level_set(double background);
+/// An empty float grid of no class.
+std::unique_ptr<FloatGrid> new_float_grid(double background);
 std::unique_ptr<Leaves> float_grid_leaves(const FloatGrid& grid);
 
 /// Grids and metadata on their way to a file.
@@ -188,6 +190,8 @@ public:
 
 std::unique_ptr<FloatGrid> copy_grid(const FloatGrid& grid);
 void filter_mean_curvature(FloatGrid& grid, std::size_t steps, const TrackerOptions& tracker);
+/// One step weighted by the values of `mask`, 0 to 1.
+void filter_mean_curvature_masked(FloatGrid& grid, const FloatGrid& mask, const TrackerOptions& tracker);
 void filter_laplacian(FloatGrid& grid, std::size_t steps, const TrackerOptions& tracker);
 void filter_gaussian(FloatGrid& grid, std::int32_t width, const TrackerOptions& tracker);
 void filter_mean(FloatGrid& grid, std::int32_t width, const TrackerOptions& tracker);
@@ -204,5 +208,11 @@ std::unique_ptr<FloatGrid> mesh_to_level_set(rust::Slice<const float> points, ru
 std::unique_ptr<RawMesh> volume_to_mesh(const FloatGrid& grid, double iso, double adaptivity);
 double level_set_area(const FloatGrid& grid);
 double level_set_volume(const FloatGrid& grid);
+/// Moves `grid` towards `target` for a time; returns the number of steps.
+std::size_t morph(FloatGrid& grid, const FloatGrid& target, float time, bool weno5, std::uint32_t runge_kutta,
+    const TrackerOptions& tracker);
+/// Fast sweeping: the distance again in the same voxels, and in so many more layers of voxels.
+std::unique_ptr<FloatGrid> sdf_to_sdf(const FloatGrid& grid, std::int32_t iterations);
+std::unique_ptr<FloatGrid> dilate_sdf(const FloatGrid& grid, std::int32_t voxels, std::int32_t iterations);
 
 } // namespace vdb_edit

@@ -205,6 +205,8 @@ std::unique_ptr<FloatGrid> new_level_set(double background)
     return wrap(std::move(grid));
 }
 
+std::unique_ptr<FloatGrid> new_float_grid(double background) { return wrap(make_float_grid(background)); }
+
 void FloatGrid::add_leaves(rust::Slice<const std::int32_t> origins)
 {
     require(origins.size() % 3 == 0, "add_leaves: wrong length");

@@ -199,6 +199,8 @@ fn operators_say_what_they_need() {
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--iterations", "1.5"], "whole number"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--time", "-1"], "time"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--method", "magic"], "laplacian"),
+        (vec!["smooth", "a.vdb", "-o", "b.vdb", "--method", "mean", "--width", "9"], "1 to 8"),
+        (vec!["smooth", "a.vdb", "-o", "b.vdb", "--width", "1"], "median"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--region", "spere radius=1"], "`sphere`"),
         (vec!["csg", "union", "a.vdb", "-o", "b.vdb"], "2 values"),
         (vec!["csg", "xor", "a.vdb", "a.vdb", "-o", "b.vdb"], "difference"),
@@ -585,4 +587,30 @@ fn manual_pages_are_written_into_a_folder() {
     let smooth = std::fs::read_to_string(desk.path("pages/vdb-edit-smooth.1")).unwrap();
     assert!(smooth.contains("iterations"));
     desk.run(&["man", "smoth"]).fails(2, &["`smooth`"]);
+}
+
+#[test]
+fn info_writes_curvatures_beside_the_level_set() {
+    let desk = Desk::new();
+    desk.sphere("s.vdb");
+    for (kind, exact) in [("mean", 1.0), ("gaussian", 1.0), ("min", 1.0), ("max", 1.0)] {
+        let out = format!("{kind}.vdb");
+        let found = desk.done(&["info", "s.vdb", "--write-curvature", kind, &out, "--json"]).json();
+        let written = &found["curvature"];
+        assert_eq!((&written["kind"], &written["output"]), (&kind.into(), &out.clone().into()));
+        // On level sets of radius 0.75 to 1.25, where the stencil fits into the band; the principal ones differ from them by up to h.
+        let power = if kind == "gaussian" { 2 } else { 1 };
+        let (least, most) = (written["min"].as_f64().unwrap(), written["max"].as_f64().unwrap());
+        assert!(least > exact / 1.3f64.powi(power) - 0.1 && most < exact / 0.73f64.powi(power) + 0.2, "{found}");
+        let listing = vdb_edit::vdb::list(desk.path(&out)).unwrap();
+        let grids: Vec<_> = listing.grids.iter().map(|g| (g.name.as_str(), g.class.as_str())).collect();
+        assert_eq!(grids, [("surface", "level set"), (format!("{kind}_curvature").as_str(), "unknown")]);
+        assert_eq!(listing.grids[1].active_voxels(), written["voxels"].as_u64());
+        // The level set beside it is still the one to be edited.
+        assert!(desk.done(&["compare", "s.vdb", &out, "--json"]).json()["identical"].as_bool().unwrap());
+    }
+    desk.run(&["info", "s.vdb", "--write-curvature", "men", "o.vdb"]).fails(2, &["`mean`"]);
+    desk.run(&["info", "s.vdb", "--write-curvature", "mean", "o.obj"]).fails(2, &[".vdb"]);
+    desk.run(&["info", "s.vdb", "mean.vdb", "--write-curvature", "mean", "o.vdb"]).fails(2, &["one input"]);
+    assert!(!desk.path("o.vdb").exists());
 }

@@ -9,7 +9,7 @@ use vdb_edit::ops::csg::{CsgOperation, csg};
 use vdb_edit::ops::morphology::offset;
 use vdb_edit::ops::smooth::{Smooth, SmoothMethod, smooth};
 use vdb_edit::ops::{EvolutionOptions, Like, Scheme};
-use vdb_edit::pde::{SolverOptions, UpwindScheme, WenoEpsilon, renormalize, track};
+use vdb_edit::pde::{self, SolverOptions, UpwindScheme, WenoEpsilon, renormalize, track};
 use vdb_edit::run::RunOptions;
 use vdb_edit::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceMesh, ReferenceScheme, Tracker};
 
@@ -85,7 +85,7 @@ const FIRST: Tracker = Tracker { scheme: ReferenceScheme::First, runge_kutta: 1,
 
 fn smoothed(level_set: &LevelSet, method: SmoothMethod, evolution: EvolutionOptions) -> LevelSet {
     let mut ours = level_set.clone();
-    smooth(&mut ours, &Smooth { method, evolution }, &RunOptions::default()).unwrap();
+    smooth(&mut ours, &Smooth { method, evolution, ..Smooth::default() }, &RunOptions::default()).unwrap();
     ours
 }
 
@@ -100,6 +100,43 @@ fn curvature_and_laplacian_steps_with_track() {
         assert_same(name, &ours, &reference(&level_set, Filter::Laplacian(1), FIRST), 1e-5);
         let ours = smoothed(&level_set, SmoothMethod::Curvature, like.clone());
         assert_same(name, &ours, &reference(&level_set, Filter::MeanCurvature(1), Tracker::default()), 1e-5);
+    }
+}
+
+#[test]
+fn filters_with_track() {
+    let first =
+        EvolutionOptions { scheme: Some(Scheme::First), normalizations: Some(1), ..EvolutionOptions::default() };
+    let like = EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() };
+    for (name, level_set) in subjects() {
+        for (method, width, filter) in [
+            (SmoothMethod::Mean, 1, Filter::Mean(1)),
+            (SmoothMethod::Mean, 3, Filter::Mean(3)),
+            (SmoothMethod::Gaussian, 1, Filter::Gaussian(1)),
+            (SmoothMethod::Median, 1, Filter::Median(1)),
+            (SmoothMethod::Median, 2, Filter::Median(2)),
+        ] {
+            for (evolution, tracker) in [(&first, FIRST), (&like, Tracker::default())] {
+                let params = Smooth { method, width: Some(width), evolution: evolution.clone() };
+                let mut ours = level_set.clone();
+                smooth(&mut ours, &params, &RunOptions::default()).unwrap();
+                let name = format!("{name} {filter:?}");
+                assert_same(&name, &ours, &reference(&level_set, filter, tracker), 1e-4);
+            }
+        }
+    }
+}
+
+#[test]
+fn offsets_by_the_flow() {
+    for (name, level_set) in subjects() {
+        for voxels in [1.0, -1.0, 0.7] {
+            let distance = voxels * level_set.voxel_size();
+            let mut ours = level_set.clone();
+            pde::offset(&mut ours, distance, None, &SolverOptions::OPENVDB, &RunOptions::default()).unwrap();
+            let theirs = reference(&level_set, Filter::Offset(distance as f32), Tracker::default());
+            assert_same(&format!("{name} {voxels}"), &ours, &theirs, 1e-4);
+        }
     }
 }
 

@@ -26,9 +26,12 @@ impl Context {
         if let Some(display) = reporter.display() {
             run = run.with_progress(display);
         }
-        if let Some(threads) = matches.get_one::<u32>("threads").map(|n| *n as usize) {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
-            pool.map_err(|e| EditError::parameter("vdb-edit", "threads", threads, e.to_string()))?;
+        // This thread is one of the pool's: handing every parallel loop over to another thread and waiting for that to wake up
+        // doubled the time of short operators. 0 is the number of processors.
+        let threads = matches.get_one::<u32>("threads").map_or(0, |n| *n as usize);
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).use_current_thread().build_global();
+        pool.map_err(|e| EditError::parameter("vdb-edit", "threads", threads, e.to_string()))?;
+        if threads > 0 {
             volume::set_threads(threads)?;
         }
         if let Some(isa) = matches.get_one::<IsaChoice>("isa").and_then(|choice| choice.isa()) {

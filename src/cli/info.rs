@@ -9,10 +9,10 @@ use serde_json::{Map, Value, json};
 use super::context::Context;
 use super::input::{self, InputOptions};
 use super::volume::{self, BandState, Description, GridDescription, VolumeGrid};
-use super::{Verb, args, size, table};
+use super::{Verb, args, output, size, table};
 use crate::error::{EditError, Result};
-use crate::levelset::{LevelSet, Measures, Violation};
-use crate::mesh;
+use crate::levelset::{CurvatureKind, LevelSet, Measures, Violation, curvature};
+use crate::{mesh, spec};
 
 /// The command.
 pub const VERB: Verb = Verb { name: "info", build, run };
@@ -23,18 +23,25 @@ fn build(command: Command) -> Command {
         .long("check")
         .action(ArgAction::SetTrue)
         .help("Exit with 1 when a level set breaks an invariant");
-    args::grids(
-        command.about("Say what files hold, measure level sets and verify their invariants").arg(files).arg(check),
-    )
-    .mut_arg("repair", |arg| arg.hide(true))
+    let curvature = Arg::new("write-curvature")
+        .long("write-curvature")
+        .num_args(2)
+        .value_names(["mean|gaussian|min|max", "FILE.vdb"])
+        .help("Write a curvature of the level set as a float grid, after all that the file holds");
+    let command = command.about("Say what files hold, measure level sets and verify their invariants");
+    args::grids(command.arg(files).arg(check).arg(curvature)).mut_arg("repair", |arg| arg.hide(true))
 }
 
 fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let paths: Vec<PathBuf> = args::paths(matches, "input");
     let options = InputOptions::new(matches)?;
+    let curvature = CurvatureFile::plan(matches, &paths)?;
     let mut found = Vec::new();
     for path in &paths {
         found.push(examine(path, &options, context)?);
+    }
+    if let (Some(curvature), [file]) = (curvature, &mut found[..]) {
+        curvature.write(&paths, &options, file, context)?;
     }
     for warning in found.iter().flat_map(|file| &file.warnings) {
         context.reporter.warn(warning);
@@ -48,6 +55,68 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         return Err(EditError::Unmet { operation: "--check".into(), problem: said });
     }
     Ok(())
+}
+
+/// A curvature to be written.
+struct CurvatureFile {
+    kind: CurvatureKind,
+    /// The name of the kind on the command line.
+    word: &'static str,
+    path: PathBuf,
+}
+
+impl CurvatureFile {
+    const KINDS: [(&str, CurvatureKind); 4] = [
+        ("mean", CurvatureKind::Mean),
+        ("gaussian", CurvatureKind::Gaussian),
+        ("min", CurvatureKind::Min),
+        ("max", CurvatureKind::Max),
+    ];
+
+    /// What `--write-curvature` asks for, refused now if it could not be done later.
+    fn plan(matches: &ArgMatches, inputs: &[PathBuf]) -> Result<Option<Self>> {
+        let Some(mut values) = matches.get_many::<String>("write-curvature") else { return Ok(None) };
+        let (Some(word), Some(path)) = (values.next(), values.next()) else { return Ok(None) };
+        let refuse =
+            |value: &str, accepted: String| Err(EditError::parameter("info", "write-curvature", value, accepted));
+        let Some((known, kind)) = Self::KINDS.into_iter().find(|(name, _)| name == word) else {
+            return refuse(word, spec::suggest(word, Self::KINDS.into_iter().map(|(name, _)| name)));
+        };
+        let path = PathBuf::from(path);
+        if input::is_pipe(&path) || !input::is_volume(&path) {
+            return refuse(&path.display().to_string(), "a file name that ends in .vdb".into());
+        }
+        if inputs.len() != 1 || inputs.iter().any(|input| input::is_pipe(input)) {
+            return refuse(word, "one input that is a file".into());
+        }
+        output::writable(&path)?;
+        Ok(Some(Self { kind, word: known, path }))
+    }
+
+    /// Computes and writes it, and adds it to what is said of the file.
+    fn write(self, inputs: &[PathBuf], options: &InputOptions, found: &mut Found, context: &Context) -> Result<()> {
+        let loaded = input::load(inputs, options, &mut found.warnings, context)?;
+        let Some(input) = loaded.first() else { return Ok(()) };
+        let field = curvature(&input.level_set, self.kind, &context.run)?;
+        let name = format!("{}_curvature", self.word);
+        let to_write = volume::FieldToWrite { field: &field, name: &name };
+        let (bytes, warnings) =
+            volume::write_field(&self.path, &input.level_set, to_write, input.from().map(|(volume, _)| volume))?;
+        found.warnings.extend(warnings);
+        let (least, most) = field.range().unwrap_or_default();
+        let unit = if self.kind == CurvatureKind::Gaussian { "world unit²" } else { "world unit" };
+        let shown = |v: f32| table::number(v.into());
+        found.text +=
+            &format!("{}: grid {name}, {} .. {} per {unit}\n", self.path.display(), shown(least), shown(most));
+        if let Some(object) = found.json.as_object_mut() {
+            let written = json!({
+                "kind": self.word, "output": self.path.display().to_string(), "grid": name, "bytes": bytes,
+                "voxels": field.grid().active_voxels(), "min": least, "max": most,
+            });
+            object.insert("curvature".into(), written);
+        }
+        Ok(())
+    }
 }
 
 /// What was found in a file.

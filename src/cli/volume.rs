@@ -9,6 +9,7 @@ use super::output::VolumeOptions;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
+pub use crate::vdb::FieldToWrite;
 use crate::vdb::{
     Band, Compression, GridListing, GridToWrite, MetaItem, Precision, ReadLevelSet, VdbFile, WriteOptions,
 };
@@ -145,6 +146,21 @@ pub fn write(
     let index = from.and_then(|(_, index)| index);
     let grid = GridToWrite { level_set, name: index.is_none().then_some(NEW_NAME), replaces: index };
     let report = crate::vdb::write(path, &[grid], from.map(|(volume, _)| &volume.file), &options)?;
+    Ok((report.bytes, report.warnings))
+}
+
+/// Writes a field of a level set after all that is in the file that the level set came from, or after the level set itself.
+/// Returns the size of the file and what is not as asked.
+pub fn write_field(
+    path: &Path,
+    level_set: &LevelSet,
+    field: FieldToWrite,
+    from: Option<&Volume>,
+) -> Result<(u64, Vec<String>)> {
+    let grid = GridToWrite { level_set, name: Some(NEW_NAME), replaces: None };
+    let grids = if from.is_none() { std::slice::from_ref(&grid) } else { &[] };
+    let file = from.map(|volume| &volume.file);
+    let report = crate::vdb::write_with_fields(path, grids, &[field], file, &WriteOptions::default())?;
     Ok((report.bytes, report.warnings))
 }
 

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use super::output::VolumeOptions;
 use crate::error::{EditError, Result};
-use crate::levelset::LevelSet;
+use crate::levelset::{Field, LevelSet};
 use crate::run::RunOptions;
 
 const ABSENT: &str = "this vdb-edit was built without OpenVDB; build it with the feature `openvdb`";
@@ -84,6 +84,18 @@ pub fn write(
     _: Option<(&Volume, Option<usize>)>,
     _: &VolumeOptions,
 ) -> Result<(u64, Vec<String>)> {
+    Err(EditError::output(path, ABSENT))
+}
+
+/// A field on its way to a file.
+#[allow(dead_code)] // nothing is written without OpenVDB
+pub struct FieldToWrite<'a> {
+    pub field: &'a Field,
+    pub name: &'a str,
+}
+
+/// Refuses.
+pub fn write_field(path: &Path, _: &LevelSet, _: FieldToWrite, _: Option<&Volume>) -> Result<(u64, Vec<String>)> {
     Err(EditError::output(path, ABSENT))
 }
 

@@ -7,14 +7,17 @@ use super::contest::{Contest, GridContest, Judge, Operation};
 use super::files::{Reading, Writing};
 use super::polygons::Polygonising;
 use crate::error::{EditError, Result};
-use crate::grid::Transform;
-use crate::levelset::LevelSet;
+use crate::grid::{Transform, offset_to_local};
+use crate::levelset::{LevelSet, sweep_distance};
 use crate::mesh::{MeshToLevelSet, Rebuild, mesh_to_level_set, rebuild};
 use crate::ops::csg::{CsgOperation, csg};
 use crate::ops::morphology::offset;
 use crate::ops::smooth::{Smooth, SmoothMethod, smooth};
-use crate::ops::{EvolutionOptions, Like, Scheme};
-use crate::pde::{SolverOptions, UpwindScheme, WenoEpsilon, renormalize, track};
+use crate::ops::{EvolutionOptions, Like, RegionSpecs, Scheme};
+use crate::pde::{
+    self, MorphOptions, SolverOptions, Until, UpwindScheme, WenoEpsilon, morph_towards, renormalize, track,
+};
+use crate::region::Primitive;
 use crate::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceScheme, Tracker};
 
 /// A row of the table.
@@ -31,9 +34,17 @@ pub(super) struct Case {
 
 const FIRST_STEP: &str = "one step and track, first order, RK1, 1";
 
+const FILTER: &str = "width 1, HJ-WENO5, RK1, 3";
+
 /// All rows, in order.
 pub(super) const CASES: &[Case] = &[
     Case { operator: "mean-curvature", scheme: FIRST_STEP, tolerance: 1e-5, contest: mean_curvature },
+    Case {
+        operator: "masked-mean-curvature",
+        scheme: "8 % of the surface, one step and track, first order, RK1, 1; compared where the weight is 1, five voxels inside",
+        tolerance: 1e-5,
+        contest: masked_mean_curvature,
+    },
     Case { operator: "laplacian", scheme: FIRST_STEP, tolerance: 1e-5, contest: laplacian },
     Case {
         operator: "mean-curvature-default",
@@ -44,11 +55,21 @@ pub(super) const CASES: &[Case] = &[
     Case { operator: "normalize-first", scheme: "first order, RK1, 1", tolerance: 1e-5, contest: normalize_first },
     Case { operator: "normalize-weno5", scheme: "HJ-WENO5, RK1, 1", tolerance: 1e-5, contest: normalize_weno5 },
     Case { operator: "track", scheme: "HJ-WENO5, RK1, 3", tolerance: 1e-5, contest: whole_track },
+    Case { operator: "offset-pde", scheme: "one voxel, HJ-WENO5, RK1, 3", tolerance: 1e-4, contest: offset_by_flow },
     Case {
         operator: "offset",
         scheme: "one voxel: exact, against HJ-WENO5, RK1, 3",
         tolerance: 0.05,
         contest: exact_offset,
+    },
+    Case { operator: "gaussian", scheme: FILTER, tolerance: 1e-4, contest: gaussian },
+    Case { operator: "mean", scheme: FILTER, tolerance: 1e-4, contest: mean },
+    Case { operator: "median", scheme: FILTER, tolerance: 1e-4, contest: median },
+    Case {
+        operator: "morph",
+        scheme: "towards a copy one voxel larger, time 1, HJ-WENO5, RK2; track HJ-WENO5, RK1, 3",
+        tolerance: 1e-3,
+        contest: morph,
     },
     Case {
         operator: "csg-union",
@@ -61,6 +82,18 @@ pub(super) const CASES: &[Case] = &[
         scheme: "half width 3, against levelSetRebuild",
         tolerance: 0.05,
         contest: exact_rebuild,
+    },
+    Case {
+        operator: "sweep",
+        scheme: "distances again in the same band, first order, against sdfToSdf",
+        tolerance: 0.5,
+        contest: sweep,
+    },
+    Case {
+        operator: "sweep-outwards",
+        scheme: "band three voxels wider, first order, against dilateSdf",
+        tolerance: 1.0,
+        contest: sweep_outwards,
     },
     Case {
         operator: "mesh-to-level-set",
@@ -99,7 +132,7 @@ fn same<'a>(
     GridContest::new(input, Judge::Equal, Operation::in_place(ours), theirs)
 }
 
-/// One step of a smoothing flow.
+/// One step of a smoothing flow, or one application of a filter.
 fn flow<'a>(
     input: &'a Input<'a>,
     method: SmoothMethod,
@@ -108,7 +141,7 @@ fn flow<'a>(
     tracker: Tracker,
 ) -> Sides<'a> {
     let evolution = EvolutionOptions { iterations: Some(1), ..evolution };
-    let (params, run) = (Smooth { method, evolution }, input.run.clone());
+    let (params, run) = (Smooth { method, evolution, ..Smooth::default() }, input.run.clone());
     same(input, move |grid| smooth(grid, &params, &run).map(drop), filter, tracker)
 }
 
@@ -120,13 +153,77 @@ fn mean_curvature<'a>(input: &'a Input<'a>) -> Sides<'a> {
     flow(input, SmoothMethod::Curvature, first_order(), Filter::MeanCurvature(1), FIRST)
 }
 
+/// The part of the surface that a masked row works on.
+const MASKED: f64 = 0.08;
+
+/// In a sphere around the highest voxel. OpenVDB renormalises everywhere, ours where the region acts.
+fn masked_mean_curvature<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (grid, transform) = (input.level_set.grid(), *input.level_set.transform());
+    let mut voxels = Vec::new();
+    for &id in grid.leaves() {
+        voxels.extend(grid.mask(id).iter().map(|o| transform.voxel_to_world(grid.origin(id) + offset_to_local(o))));
+    }
+    let Some(&centre) = voxels.iter().max_by(|a, b| a.z.total_cmp(&b.z)) else {
+        return Err(EditError::parameter("crosscheck", "only", "masked-mean-curvature", "a level set with a surface"));
+    };
+    let mut distances: Vec<f64> = voxels.iter().map(|voxel| voxel.distance(centre)).collect();
+    distances.sort_by(f64::total_cmp);
+    let radius = distances[(distances.len() as f64 * MASKED) as usize];
+    let spec = format!("sphere center={},{},{} radius={radius}", centre.x, centre.y, centre.z);
+    let evolution = EvolutionOptions { iterations: Some(1), region: RegionSpecs(vec![spec]), ..first_order() };
+    let region = evolution.region.parse()?;
+    let mut weights = input.level_set.clone();
+    weights.grid_mut().update_all(|id, values, _| {
+        let origin = grid.origin(id);
+        for (offset, value) in values.0.iter_mut().enumerate() {
+            let xyz = transform.voxel_to_world(origin + offset_to_local(offset));
+            *value = region.as_ref().map_or(1.0, |region| region.weight(xyz));
+        }
+    });
+    let weights = ReferenceGrid::from_level_set(&weights)?;
+    let inside = Primitive::DEFAULT_SOFT[0] * radius - 5.0 * transform.voxel_size();
+    let counts = move |ijk| transform.voxel_to_world(ijk).distance(centre) < inside;
+    let (params, run) = (Smooth { evolution, ..Smooth::default() }, input.run.clone());
+    GridContest::new(
+        input,
+        Judge::EqualAt(Box::new(counts)),
+        Operation::in_place(move |grid| smooth(grid, &params, &run).map(drop)),
+        Operation::in_place(move |grid: &mut ReferenceGrid| grid.mean_curvature_masked(&weights, &FIRST)),
+    )
+}
+
 fn laplacian<'a>(input: &'a Input<'a>) -> Sides<'a> {
     flow(input, SmoothMethod::Laplacian, first_order(), Filter::Laplacian(1), FIRST)
 }
 
+fn like_openvdb() -> EvolutionOptions {
+    EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() }
+}
+
 fn mean_curvature_default<'a>(input: &'a Input<'a>) -> Sides<'a> {
-    let like = EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() };
-    flow(input, SmoothMethod::Curvature, like, Filter::MeanCurvature(1), Tracker::default())
+    flow(input, SmoothMethod::Curvature, like_openvdb(), Filter::MeanCurvature(1), Tracker::default())
+}
+
+fn gaussian<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Gaussian, like_openvdb(), Filter::Gaussian(1), Tracker::default())
+}
+
+fn mean<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Mean, like_openvdb(), Filter::Mean(1), Tracker::default())
+}
+
+fn median<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Median, like_openvdb(), Filter::Median(1), Tracker::default())
+}
+
+fn offset_by_flow<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (voxel, run) = (input.level_set.voxel_size(), input.run.clone());
+    same(
+        input,
+        move |grid| pde::offset(grid, voxel, None, &SolverOptions::OPENVDB, &run).map(drop),
+        Filter::Offset(voxel as f32),
+        Tracker::default(),
+    )
 }
 
 fn normalize_first<'a>(input: &'a Input<'a>) -> Sides<'a> {
@@ -161,6 +258,19 @@ fn exact_offset<'a>(input: &'a Input<'a>) -> Sides<'a> {
     )
 }
 
+fn morph<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let target = offset(input.level_set, input.level_set.voxel_size(), input.run)?;
+    let reference = ReferenceGrid::from_level_set(&target)?;
+    let run = input.run.clone();
+    let ours = move |grid: &mut LevelSet| {
+        morph_towards(grid, &target, None, Until::Time(1.0), &MorphOptions::OPENVDB, &run).map(drop)
+    };
+    let theirs = move |grid: &mut ReferenceGrid| {
+        grid.morph(&reference, 1.0, ReferenceScheme::HjWeno5, 2, &Tracker::default()).map(drop)
+    };
+    GridContest::new(input, Judge::Equal, Operation::in_place(ours), Operation::in_place(theirs))
+}
+
 fn csg_union<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let shifted = shifted(input.level_set)?;
     let (reference, run) = (ReferenceGrid::from_level_set(&shifted)?, input.run.clone());
@@ -179,6 +289,26 @@ fn exact_rebuild<'a>(input: &'a Input<'a>) -> Sides<'a> {
         Judge::Truth { offset: 0.0 },
         Operation::new(move |grid| rebuild(grid, &Rebuild::band(3.0), &run)),
         Operation::new(|grid: &ReferenceGrid| grid.rebuild(0.0, 3.0)),
+    )
+}
+
+fn sweep<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (half_width, run) = (input.level_set.half_width(), input.run.clone());
+    GridContest::new(
+        input,
+        Judge::Truth { offset: 0.0 },
+        Operation::new(move |grid| sweep_distance(grid, half_width, &run)),
+        Operation::new(|grid: &ReferenceGrid| grid.sweep(1)),
+    )
+}
+
+fn sweep_outwards<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (half_width, run) = (input.level_set.half_width() + 3.0, input.run.clone());
+    GridContest::new(
+        input,
+        Judge::Truth { offset: 0.0 },
+        Operation::new(move |grid| sweep_distance(grid, half_width, &run)),
+        Operation::new(|grid: &ReferenceGrid| grid.sweep_outwards(3, 1)),
     )
 }
 

@@ -2,6 +2,8 @@
 
 use std::time::Instant;
 
+use glam::IVec3;
+
 use super::Input;
 use super::difference::Difference;
 use crate::error::Result;
@@ -54,6 +56,8 @@ impl<Grid> Operation<Grid> {
 pub(super) enum Judge {
     /// Voxel by voxel.
     Equal,
+    /// Voxel by voxel where this holds.
+    EqualAt(Box<dyn Fn(IVec3) -> bool>),
     /// Voxel by voxel where both have one sign.
     SignedAlike,
     /// Both against the distance to the polygonised input, less this offset (in voxels).
@@ -102,21 +106,20 @@ impl Contest for GridContest<'_> {
     fn difference(&self) -> Result<Difference> {
         let (Some(ours), Some(theirs)) = &self.results else { return Ok(Difference::default()) };
         let theirs = theirs.to_level_set()?;
-        Ok(match self.judge {
+        Ok(match &self.judge {
             Judge::Equal => Difference::between(ours, &theirs, |_, _, _| true),
+            Judge::EqualAt(counts) => Difference::between(ours, &theirs, |ijk, _, _| counts(ijk)),
             Judge::SignedAlike => Difference::between(ours, &theirs, |_, a, b| (a < 0.0) == (b < 0.0)),
             Judge::Truth { offset } => {
-                Difference::to_truth(ours, &theirs, self.input.truth()?, self.input.level_set, offset)
+                Difference::to_truth(ours, &theirs, self.input.truth()?, self.input.level_set, *offset)
             }
         })
     }
 }
 
-/// A copy that shares no page with the original, as OpenVDB's deep copy.
+/// A copy that shares nothing with the original, as OpenVDB's deep copy.
 fn unshared(level_set: &LevelSet) -> LevelSet {
-    let mut copy = level_set.clone();
-    copy.grid_mut().update_all(|_, _, _| ());
-    copy
+    LevelSet::new(level_set.grid().deep_copy(), *level_set.transform())
 }
 
 /// The result of `f` and the milliseconds it took.

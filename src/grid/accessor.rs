@@ -55,4 +55,20 @@ impl<'a> Accessor<'a> {
             self.value(ijk + IVec3::new(c >> 2, c >> 1 & 1, c & 1))
         })
     }
+
+    /// Values of the 27 voxels around and including `ijk`, in the order x·9 + y·3 + z from −1 on.
+    #[inline(always)]
+    pub fn block(&mut self, ijk: IVec3) -> [f32; 27] {
+        let local: IVec3 = ijk & 7;
+        if local.min_element() > 0 && local.max_element() < 7 {
+            let id = self.leaf(ijk);
+            let first = leaf_offset(ijk) - (64 + 8 + 1);
+            let v = &self.grid.values(id).0;
+            return std::array::from_fn(|q| v[first + q / 9 * 64 + q / 3 % 3 * 8 + q % 3]);
+        }
+        std::array::from_fn(|q| {
+            let q = q as i32;
+            self.value(ijk + IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1))
+        })
+    }
 }

@@ -21,6 +21,12 @@ impl LeafValues {
     pub fn filled(value: f32) -> Self {
         Self([value; LEAF_VOXELS])
     }
+
+    /// Whether all values are negative (`true`) or none is (`false`); `None` if they differ.
+    pub fn one_sign(&self) -> Option<bool> {
+        let (any, all) = self.0.iter().fold((0, u32::MAX), |(any, all), v| (any | v.to_bits(), all & v.to_bits()));
+        (any >> 31 == all >> 31).then_some(any >> 31 == 1)
+    }
 }
 
 impl Default for LeafValues {
@@ -46,11 +52,14 @@ impl LeafMask {
     pub const FULL: Self = Self([u64::MAX; 8]);
 
     /// Whether no voxel is active.
+    #[inline(always)]
     pub fn is_empty(&self) -> bool {
-        self.0 == [0; 8]
+        // As an array it would be compared by a call.
+        self.0.iter().fold(0, |all, word| all | word) == 0
     }
 
     /// Number of active voxels.
+    #[inline(always)]
     pub fn count(&self) -> u32 {
         self.0.iter().map(|w| w.count_ones()).sum()
     }
@@ -107,11 +116,13 @@ impl LeafMask {
     }
 
     /// Combines two masks word by word.
+    #[inline(always)]
     pub fn zip(self, other: Self, f: impl Fn(u64, u64) -> u64) -> Self {
         Self(std::array::from_fn(|x| f(self.0[x], other.0[x])))
     }
 
     /// The voxels of this leaf that are face neighbours of its active voxels, and the active voxels themselves.
+    #[inline]
     pub fn dilated(&self) -> Self {
         let m = &self.0;
         Self(std::array::from_fn(|x| {
@@ -124,6 +135,7 @@ impl LeafMask {
     }
 
     /// The voxels of the neighbouring leaf across `face` that are face neighbours of this leaf's active voxels.
+    #[inline(always)]
     pub fn spill(&self, face: Face) -> Self {
         let m = &self.0;
         let mut out = [0; 8];
@@ -161,6 +173,7 @@ impl Face {
     pub const ALL: [Self; 6] = [Self::XMinus, Self::XPlus, Self::YMinus, Self::YPlus, Self::ZMinus, Self::ZPlus];
 
     /// The face across.
+    #[inline(always)]
     pub fn opposite(self) -> Self {
         match self {
             Self::XMinus => Self::XPlus,
@@ -173,6 +186,7 @@ impl Face {
     }
 
     /// The outward unit step.
+    #[inline(always)]
     pub fn step(self) -> IVec3 {
         match self {
             Self::XMinus => IVec3::NEG_X,

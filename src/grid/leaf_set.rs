@@ -1,6 +1,8 @@
 //! A set of leaves of one grid: a bit a slot, a word a page.
 
-use super::paged::{LeafId, PAGE_LEAVES};
+use rayon::prelude::*;
+
+use super::paged::{LeafId, PageLeaves};
 
 /// A set of leaf slots. The word of a page tells a parallel task which of its 64 leaves are meant.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -56,16 +58,12 @@ impl LeafSet {
 
     /// The leaves in slot order (not the order of origins).
     pub fn iter(&self) -> impl Iterator<Item = LeafId> + '_ {
-        self.words.iter().enumerate().flat_map(|(page, &word)| {
-            let mut rest = word;
-            std::iter::from_fn(move || {
-                (rest != 0).then(|| {
-                    let slot = rest.trailing_zeros() as usize;
-                    rest &= rest - 1;
-                    LeafId::new(page * PAGE_LEAVES + slot)
-                })
-            })
-        })
+        self.words.iter().enumerate().flat_map(|(page, &word)| PageLeaves::new(page, word).iter())
+    }
+
+    /// The leaves by page, for parallel tasks.
+    pub fn par_pages(&self) -> impl IndexedParallelIterator<Item = PageLeaves> + '_ {
+        self.words.par_iter().enumerate().map(|(page, &word)| PageLeaves::new(page, word))
     }
 }
 

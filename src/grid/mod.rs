@@ -11,6 +11,7 @@ mod accessor;
 mod combine;
 mod leaf;
 mod leaf_set;
+mod page_pool;
 mod paged;
 mod topology;
 mod transform;
@@ -50,12 +51,34 @@ impl Grid {
     /// A grid with leaves at `origins` (sorted by x, y, z; multiples of 8; no duplicates), every voxel inactive and outside.
     pub fn from_origins(background: f32, origins: &[IVec3]) -> Self {
         debug_assert!(background > 0.0);
-        let topology = Topology::from_origins(origins);
+        Self::blank_of(Arc::new(Topology::from_origins(origins)), background)
+    }
+
+    /// A grid of the same leaves with another background: no voxel active, every leaf outside.
+    pub(crate) fn blank(&self, background: f32) -> Self {
+        Self::blank_of(self.topology.clone(), background)
+    }
+
+    fn blank_of(topology: Arc<Topology>, background: f32) -> Self {
         let mut values = Paged::filled(1, LeafValues::filled(background));
         *values.get_mut(LeafId::INSIDE) = LeafValues::filled(-background);
         values.grow(topology.page_count(), LeafValues::filled(background));
         let masks = Paged::filled(topology.page_count(), LeafMask::EMPTY);
-        Self { background, topology: Arc::new(topology), values, masks }
+        Self { background, topology, values, masks }
+    }
+
+    /// A grid of the same leaves and active voxels whose values are all 0, the background as well: for fields that are no distance.
+    pub(crate) fn zeroed(&self) -> Self {
+        let values = Paged::filled(self.topology.page_count(), LeafValues::default());
+        Self { background: 0.0, topology: self.topology.clone(), values, masks: self.masks.clone() }
+    }
+
+    /// A copy that shares nothing with this grid.
+    pub fn deep_copy(&self) -> Self {
+        let mut copy = self.clone();
+        Arc::make_mut(&mut copy.topology).unshare();
+        copy.update_all(|_, _, _| ());
+        copy
     }
 
     /// The value that stands for everything outside; its negative for everything inside.
@@ -165,30 +188,23 @@ impl Grid {
         &self.masks
     }
 
-    /// Origins of the absent leaves that face neighbours of the voxels of `seed` lie in, sorted. `seed` has the pages of this grid.
-    pub fn absent_beside(&self, seed: &Paged<LeafMask>) -> Vec<IVec3> {
+    /// Origins of the absent leaves that face neighbours of the voxels of `seed` lie in, sorted. `seed` is empty but in the leaves of `set`.
+    pub fn absent_beside(&self, seed: &Paged<LeafMask>, set: &LeafSet) -> Vec<IVec3> {
         let around = self.neighbours();
-        let mut origins: Vec<IVec3> = self
-            .map_leaves(|id| {
-                let mask = seed.get(id);
-                let mut absent = smallvec::SmallVec::<[IVec3; 6]>::new();
-                for face in Face::ALL {
-                    let beyond = around[id.index()][neighbour_index(face.step())];
-                    if beyond.is_sentinel() && !mask.spill(face).is_empty() {
-                        absent.push(self.origin(id) + face.step() * LEAF_DIM);
-                    }
-                }
-                absent
+        let beside = |id: LeafId| {
+            let around = &around[id.index()];
+            Face::ALL.into_iter().filter_map(move |face| {
+                let absent = around[neighbour_index(face.step())].is_sentinel() && !seed.get(id).spill(face).is_empty();
+                absent.then(|| self.origin(id) + face.step() * LEAF_DIM)
             })
-            .into_iter()
-            .flatten()
-            .collect();
+        };
+        let mut origins: Vec<IVec3> = set.par_pages().flat_map_iter(|leaves| leaves.iter().flat_map(beside)).collect();
         origins.sort_unstable_by_key(|o| (o.x, o.y, o.z));
         origins.dedup();
         origins
     }
 
-    /// Activates the voxels of `seed` and their face neighbours, in the leaves of `set`.
+    /// Activates the voxels of `seed` and their face neighbours, in the leaves of `set`. `seed` has the pages of this grid.
     pub fn activate_beside(&mut self, seed: &Paged<LeafMask>, set: &LeafSet) {
         let around = self.topology.neighbours();
         self.masks.par_update(set, |id, mask| {
@@ -218,6 +234,17 @@ impl Grid {
         std::mem::swap(&mut self.values, buffer);
     }
 
+    /// Takes the masks out, to be changed while the rest of the grid is read. Until they are restored there are none to look at.
+    pub(crate) fn take_masks(&mut self) -> Paged<LeafMask> {
+        std::mem::take(&mut self.masks)
+    }
+
+    /// Puts back what [`take_masks`](Self::take_masks) took.
+    pub(crate) fn restore_masks(&mut self, masks: Paged<LeafMask>) {
+        debug_assert_eq!(self.values.page_count(), masks.page_count());
+        self.masks = masks;
+    }
+
     /// Adds leaves at `origins` (sorted, no leaf there yet): all voxels inactive, with the sign that the space had. Returns their ids.
     pub fn add_leaves(&mut self, origins: &[IVec3]) -> Vec<LeafId> {
         if origins.is_empty() {
@@ -225,26 +252,26 @@ impl Grid {
         }
         let topology = Arc::make_mut(&mut self.topology);
         let added = topology.insert(origins);
-        self.values.grow(topology.page_count(), LeafValues::filled(self.background));
+        self.values.grow_unwritten(topology.page_count());
         self.masks.grow(topology.page_count(), LeafMask::EMPTY);
-        for &(id, sentinel) in &added {
-            let value = if sentinel == LeafId::INSIDE { -self.background } else { self.background };
-            self.values.get_mut(id).0.fill(value);
-            *self.masks.get_mut(id) = LeafMask::EMPTY;
-        }
-        added.into_iter().map(|(id, _)| id).collect()
+        let inside: LeafSet =
+            added.iter().filter(|(_, sentinel)| *sentinel == LeafId::INSIDE).map(|(id, _)| *id).collect();
+        let added: Vec<LeafId> = added.into_iter().map(|(id, _)| id).collect();
+        let (set, background) = (added.iter().copied().collect(), self.background);
+        self.update(&set, |id, values, mask| {
+            values.0.fill(if inside.contains(id) { -background } else { background });
+            *mask = LeafMask::EMPTY;
+        });
+        added
     }
 
     /// Removes those of `candidates` that have no active voxel and one sign, which stays known.
     pub fn prune(&mut self, candidates: &LeafSet) -> Vec<LeafId> {
         let removed: Vec<_> = candidates
-            .iter()
+            .par_pages()
+            .flat_map_iter(PageLeaves::iter)
             .filter(|&id| self.mask(id).is_empty())
-            .filter_map(|id| {
-                let values = &self.values(id).0;
-                let inside = values[0] < 0.0;
-                values.iter().all(|v| (*v < 0.0) == inside).then_some((id, LeafId::sentinel(inside)))
-            })
+            .filter_map(|id| Some((id, LeafId::sentinel(self.values(id).one_sign()?))))
             .collect();
         if !removed.is_empty() {
             Arc::make_mut(&mut self.topology).remove(&removed);

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::leaf_set::LeafSet;
+use super::page_pool::Pooled;
 
 /// Leaves in a page: 128 KiB of values, the size of one parallel task.
 pub const PAGE_LEAVES: usize = 64;
@@ -53,12 +54,14 @@ impl LeafId {
 
 /// One `T` a leaf slot, in pages of [`PAGE_LEAVES`] behind `Arc`: a clone copies page pointers, a write copies only the
 /// page that it touches while that page is shared.
+///
+/// Pages of values that nobody holds any more are kept for the next array (`page_pool`).
 #[derive(Clone, Debug, Default)]
-pub struct Paged<T> {
+pub struct Paged<T: Pooled> {
     pages: Vec<Arc<[T]>>,
 }
 
-impl<T: Clone + Send + Sync> Paged<T> {
+impl<T: Pooled> Paged<T> {
     /// `pages` pages that share one page of `value`.
     pub fn filled(pages: usize, value: T) -> Self {
         Self { pages: vec![Self::page_of(value); pages] }
@@ -66,6 +69,34 @@ impl<T: Clone + Send + Sync> Paged<T> {
 
     fn page_of(value: T) -> Arc<[T]> {
         std::iter::repeat_n(value, PAGE_LEAVES).collect()
+    }
+
+    /// The page for writing, copied first if it is shared.
+    fn own(page: &mut Arc<[T]>) -> &mut [T] {
+        if Arc::get_mut(page).is_none()
+            && let Some(mut own) = T::used_page()
+        {
+            if let Some(entries) = Arc::get_mut(&mut own) {
+                entries.clone_from_slice(page);
+            }
+            *page = own;
+        }
+        Arc::make_mut(page)
+    }
+
+    /// The page for writing, and whether it is new: then its entries of `word` hold anything. A shared page is not copied
+    /// but for the entries beside `word`.
+    fn own_unwritten(page: &mut Arc<[T]>, word: u64) -> (&mut [T], bool) {
+        let new = Arc::get_mut(page).is_none();
+        if new && let Some(mut own) = T::used_page() {
+            if let Some(entries) = Arc::get_mut(&mut own) {
+                for slot in (0..PAGE_LEAVES).filter(|slot| word >> slot & 1 == 0) {
+                    entries[slot].clone_from(&page[slot]);
+                }
+            }
+            *page = own;
+        }
+        (Arc::make_mut(page), new)
     }
 
     /// Number of pages.
@@ -77,6 +108,16 @@ impl<T: Clone + Send + Sync> Paged<T> {
     pub fn grow(&mut self, pages: usize, value: T) {
         if self.pages.len() < pages {
             self.pages.resize(pages, Self::page_of(value));
+        }
+    }
+
+    /// Appends pages that hold anything until there are `pages`: for slots that are written before they are read.
+    pub fn grow_unwritten(&mut self, pages: usize)
+    where
+        T: Default,
+    {
+        while self.pages.len() < pages {
+            self.pages.push(T::used_page().unwrap_or_else(|| Self::page_of(T::default())));
         }
     }
 
@@ -93,7 +134,7 @@ impl<T: Clone + Send + Sync> Paged<T> {
 
     /// The entry of a leaf for writing; its page is copied first if it is shared.
     pub fn get_mut(&mut self, id: LeafId) -> &mut T {
-        &mut Arc::make_mut(&mut self.pages[id.page()])[id.slot()]
+        &mut Self::own(&mut self.pages[id.page()])[id.slot()]
     }
 
     /// Appends a page of `other`, shared with it.
@@ -117,7 +158,7 @@ impl<T: Clone + Send + Sync> Paged<T> {
             .enumerate()
             .filter_map(|(page, data)| {
                 let word = set.word(page);
-                (word != 0).then(|| f(PageLeaves { page, word }, Arc::make_mut(data)))
+                (word != 0).then(|| f(PageLeaves { page, word }, Self::own(data)))
             })
             .collect()
     }
@@ -125,7 +166,7 @@ impl<T: Clone + Send + Sync> Paged<T> {
     /// As [`par_update_pages`](Self::par_update_pages) over two arrays of one grid at once.
     pub fn par_update_pages_with<U, R, F>(&mut self, other: &mut Paged<U>, set: &LeafSet, f: F) -> Vec<R>
     where
-        U: Clone + Send + Sync,
+        U: Pooled,
         R: Send,
         F: Fn(PageLeaves, &mut [T], &mut [U]) -> R + Sync,
     {
@@ -135,7 +176,7 @@ impl<T: Clone + Send + Sync> Paged<T> {
             .enumerate()
             .filter_map(|(page, (a, b))| {
                 let word = set.word(page);
-                (word != 0).then(|| f(PageLeaves { page, word }, Arc::make_mut(a), Arc::make_mut(b)))
+                (word != 0).then(|| f(PageLeaves { page, word }, Self::own(a), Paged::own(b)))
             })
             .collect()
     }
@@ -145,9 +186,56 @@ impl<T: Clone + Send + Sync> Paged<T> {
         self.par_update_pages(set, |leaves, data| leaves.for_each(|id| f(id, &mut data[id.slot()])));
     }
 
+    /// Copies those pages of the leaves of `set` that are shared.
+    pub fn own_pages(&mut self, set: &LeafSet) {
+        self.par_update_pages(set, |_, _| ());
+    }
+
+    /// As [`par_update_pages`](Self::par_update_pages) for an `f` that writes its leaves wholly if it is told `true`: a page that is
+    /// shared is not copied then but replaced by one whose entries of `set` hold anything.
+    pub fn par_rewrite_pages<F>(&mut self, set: &LeafSet, f: F)
+    where
+        F: Fn(PageLeaves, bool, &mut [T]) + Sync,
+    {
+        self.pages.par_iter_mut().enumerate().for_each(|(page, data)| {
+            let word = set.word(page);
+            if word != 0 {
+                let (own, new) = Self::own_unwritten(data, word);
+                f(PageLeaves { page, word }, new, own);
+            }
+        });
+    }
+
+    /// As [`par_rewrite_pages`](Self::par_rewrite_pages) with a second array of the grid beside it, whose pages keep their entries.
+    pub fn par_rewrite_pages_with<U, R, F>(&mut self, other: &mut Paged<U>, set: &LeafSet, f: F) -> Vec<R>
+    where
+        U: Pooled,
+        R: Send,
+        F: Fn(PageLeaves, bool, &mut [T], &mut [U]) -> R + Sync,
+    {
+        self.pages
+            .par_iter_mut()
+            .zip(&mut other.pages)
+            .enumerate()
+            .filter_map(|(page, (a, b))| {
+                let word = set.word(page);
+                (word != 0).then(|| {
+                    let (own, new) = Self::own_unwritten(a, word);
+                    f(PageLeaves { page, word }, new, own, Paged::own(b))
+                })
+            })
+            .collect()
+    }
+
     /// Bytes of the pages, shared ones included.
     pub fn bytes(&self) -> u64 {
         (self.pages.len() * PAGE_LEAVES * size_of::<T>()) as u64
+    }
+}
+
+impl<T: Pooled> Drop for Paged<T> {
+    fn drop(&mut self) {
+        self.pages.drain(..).for_each(T::keep_page);
     }
 }
 
@@ -159,6 +247,22 @@ pub struct PageLeaves {
 }
 
 impl PageLeaves {
+    pub(super) fn new(page: usize, word: u64) -> Self {
+        Self { page, word }
+    }
+
+    /// The leaves, in slot order.
+    pub fn iter(self) -> impl Iterator<Item = LeafId> {
+        let mut rest = self.word;
+        std::iter::from_fn(move || {
+            (rest != 0).then(|| {
+                let slot = rest.trailing_zeros() as usize;
+                rest &= rest - 1;
+                LeafId::new(self.page * PAGE_LEAVES + slot)
+            })
+        })
+    }
+
     /// Calls `f` with each leaf, in slot order.
     #[inline(always)]
     pub fn for_each(self, mut f: impl FnMut(LeafId)) {
@@ -180,6 +284,8 @@ impl PageLeaves {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    impl Pooled for u32 {}
 
     #[test]
     fn a_write_copies_only_its_page() {

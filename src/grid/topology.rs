@@ -134,6 +134,11 @@ impl Topology {
         (self.nodes.len() * size_of::<NodeTable>() + self.origins.len() * per_leaf) as u64
     }
 
+    /// Copies the tables that are shared with other topologies.
+    pub fn unshare(&mut self) {
+        self.nodes.values_mut().for_each(|table| _ = Arc::make_mut(table));
+    }
+
     /// Adds leaves at `origins` (sorted, no leaf there yet); returns them with the sentinel that they replace.
     pub fn insert(&mut self, origins: &[IVec3]) -> Vec<(LeafId, LeafId)> {
         let mut added = Vec::with_capacity(origins.len());
@@ -149,8 +154,9 @@ impl Topology {
         self.merge_order(&added);
         if let Some(mut table) = self.neighbours.take() {
             table.resize(self.origins.len(), [LeafId::OUTSIDE; 27]);
+            let mut cache = NodeCache::default();
             for &(id, _) in &added {
-                let around = self.neighbours_of(id, &mut NodeCache::default());
+                let around = self.neighbours_of(id, &mut cache);
                 table[id.index()] = around;
                 relink(&mut table, &around, |_| id);
             }

@@ -14,7 +14,7 @@ const LARGEST_BLOCK: i32 = 1 << 30;
 const OPERATION: &str = "sampling a distance function";
 
 /// Bytes that a leaf costs while it is built: its values twice (collected, then in pages), mask and tables.
-const BYTES_A_LEAF: u64 = 2 * 2048 + 512;
+pub(crate) const BYTES_A_LEAF: u64 = 2 * 2048 + 512;
 
 impl LevelSet {
     /// The level set of a signed distance function given in **index space and voxels**: `distance(ijk)` is negative inside,
@@ -63,14 +63,21 @@ impl LevelSet {
 }
 
 /// A grid of the given leaves, sorted here; the signs of the space between are flooded from them.
-pub(crate) fn grid_of_leaves(background: f32, mut leaves: Vec<(IVec3, LeafValues, LeafMask)>) -> Grid {
+pub(crate) fn grid_of_leaves(background: f32, leaves: Vec<(IVec3, LeafValues, LeafMask)>) -> Grid {
+    grid_of_parts(background, &[leaves])
+}
+
+/// As [`grid_of_leaves`], from the parts that several tasks made.
+pub(crate) fn grid_of_parts(background: f32, parts: &[Vec<(IVec3, LeafValues, LeafMask)>]) -> Grid {
+    // Two kilobytes a leaf stay where they are until they are copied into pages.
+    let mut leaves: Vec<_> = parts.iter().flatten().collect();
     leaves.par_sort_unstable_by_key(|(o, ..)| (o.x, o.y, o.z));
     let origins: Vec<IVec3> = leaves.iter().map(|l| l.0).collect();
     let mut grid = Grid::from_origins(background, &origins);
     // A fresh grid has its leaves in slot order, so the leaf of an id is found by counting.
     let first = grid.leaves().first().map_or(0, |id| id.index());
     grid.update_all(|id, values, mask| {
-        let (_, v, m) = &leaves[id.index() - first];
+        let (_, v, m) = leaves[id.index() - first];
         values.clone_from(v);
         *mask = *m;
     });

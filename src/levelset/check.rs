@@ -269,10 +269,14 @@ struct SquaredGradients<'a> {
 impl Work for SquaredGradients<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        self.rows.for_each_pair(|x, y, _| {
-            let at = x * 64 + y * 8;
-            godunov_first(simd, self.halo, x, y).store_slice(&mut self.squared[at..at + 16]);
-        });
+        self.rows.for_each_pair(
+            #[inline(always)]
+            |x, y, _| {
+                let at = x * 64 + y * 8;
+                let phi = self.halo.rows(simd, x, y, [0; 3]);
+                godunov_first(simd, self.halo, x, y, phi).store_slice(&mut self.squared[at..at + 16]);
+            },
+        );
     }
 }
 

@@ -8,11 +8,15 @@
 //! and edges (18).
 
 use fearless_simd::{Simd, SimdBase, SimdMask};
-use glam::{DVec3, IVec3};
+use glam::{DVec3, IVec3, Vec3};
+use rayon::prelude::*;
 
 use super::marching::{EDGES, cell_case};
 use crate::error::{EditError, Result};
-use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, LeafValues, Neighbours, neighbour_index, offset_to_local};
+use crate::grid::{
+    Face, Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafValues, Neighbours, leaf_offset, neighbour_index,
+    offset_to_local,
+};
 use crate::run::RunOptions;
 use crate::stencil::simd::{Lanes, Work, dispatch};
 
@@ -231,6 +235,92 @@ impl<'a> IsoSurface<'a> {
         });
     }
 
+    /// Calls `f` with the first corner of a cell of the leaf and a triangle of it, relative to that corner, for each
+    /// triangle of the cells that are `wanted`. The cells come block by block of 2³, so that triangles that follow each other are near each other.
+    pub fn for_each_triangle(
+        &self,
+        leaf: &SurfaceLeaf,
+        wanted: impl Fn(IVec3) -> bool,
+        mut f: impl FnMut(IVec3, [Vec3; 3]),
+    ) {
+        let mut patterns = [0; LEAF_VOXELS];
+        let mut crossed = LeafMask::EMPTY;
+        self.rows(leaf).for_each_cell(|cell, pattern| {
+            if wanted(cell) {
+                let offset = leaf_offset(cell);
+                patterns[offset] = pattern;
+                crossed.set(offset, true);
+            }
+        });
+        let mut values = None;
+        for block in BLOCKS {
+            for x in 2 * block.x..2 * block.x + 2 {
+                // The bits of the block's four cells in this slice.
+                let mut rest = crossed.0[x as usize] & 0x0303 << (16 * block.y + 2 * block.z);
+                while rest != 0 {
+                    let offset = x as usize * 64 + rest.trailing_zeros() as usize;
+                    rest &= rest - 1;
+                    let cell = offset_to_local(offset);
+                    let values = values.get_or_insert_with(|| self.values_of_cells(leaf));
+                    let case = cell_case(patterns[offset]);
+                    let vertices = self.vertices_of_cell(values, cell, case.crossed);
+                    for triangle in &case.triangles {
+                        f(cell, triangle.map(|edge| vertices[usize::from(edge)]));
+                    }
+                }
+            }
+        }
+    }
+
+    /// φ at the corners of a leaf's cells: its voxels and those next to its upper sides, 9³ in all.
+    fn values_of_cells(&self, leaf: &SurfaceLeaf) -> [f32; 729] {
+        let around = &self.grid.neighbours()[leaf.id.index()];
+        let mut values = [0.0; 729];
+        for (at, row) in values.as_chunks_mut::<9>().0.iter_mut().enumerate() {
+            let (x, y) = (at / 9, at % 9);
+            let of = |z| &self.grid.values(around[neighbour_index(IVec3::new(x as i32 / 8, y as i32 / 8, z))]).0;
+            let first = (x % 8) * 64 + (y % 8) * 8;
+            row[..8].copy_from_slice(&of(0)[first..first + 8]);
+            row[8] = of(1)[first];
+        }
+        values
+    }
+
+    /// The vertices on the `crossed` edges of a cell, relative to its first corner.
+    #[inline(always)]
+    fn vertices_of_cell(&self, values: &[f32; 729], cell: IVec3, crossed: u16) -> [Vec3; 12] {
+        let first = (cell.x * 81 + cell.y * 9 + cell.z) as usize;
+        let mut vertices = [Vec3::ZERO; 12];
+        let mut rest = crossed;
+        while rest != 0 {
+            let edge = rest.trailing_zeros() as usize;
+            rest &= rest - 1;
+            let CellEdge { from, to, start, direction } = CELL_EDGES[edge];
+            let t = crossing(values[first + from], values[first + to], self.iso);
+            vertices[edge] = start + direction * t as f32;
+        }
+        vertices
+    }
+
+    /// Whether a vertex lies on a grid edge of an absent leaf: space of both signs meets there without a leaf between, and the
+    /// surface cannot be followed. Never on a valid level set.
+    pub fn is_torn(&self) -> bool {
+        let torn = |vertices: &mut CellVertices, leaf: &SurfaceLeaf| {
+            let around = &self.grid.neighbours()[leaf.id.index()];
+            if (1..8).all(|c| !around[neighbour_index(corner(c))].is_sentinel()) {
+                return false;
+            }
+            vertices.take(self, leaf);
+            let mut torn = false;
+            self.rows(leaf).for_each_cell(|cell, pattern| {
+                let crossed = cell_case(pattern).crossed;
+                torn |= (0..12).any(|edge| crossed >> edge & 1 == 1 && vertices.vertex(cell, edge).is_none());
+            });
+            torn
+        };
+        self.leaves.par_iter().with_min_len(16).map_init(CellVertices::new, torn).any(|torn| torn)
+    }
+
     /// A voxel of this leaf whose sign differs from that of the absent leaf next to it: the surface leaves the stored
     /// leaves there and cannot be followed. `None` everywhere on a valid level set.
     pub fn leak(&self, id: LeafId) -> Option<IVec3> {
@@ -248,6 +338,42 @@ impl<'a> IsoSurface<'a> {
         })
     }
 }
+
+/// An edge of a cell, within the 9³ values at the corners of a leaf's cells and in space.
+struct CellEdge {
+    from: usize,
+    to: usize,
+    start: Vec3,
+    direction: Vec3,
+}
+
+const CELL_EDGES: [CellEdge; 12] = {
+    const NONE: CellEdge = CellEdge { from: 0, to: 0, start: Vec3::ZERO, direction: Vec3::ZERO };
+    let mut edges = [NONE; 12];
+    let mut e = 0;
+    while e < 12 {
+        let (axis, corner) = EDGES[e];
+        let (x, y, z) = (corner >> 2, corner >> 1 & 1, corner & 1);
+        let from = x as usize * 81 + y as usize * 9 + z as usize;
+        let to = from + [81, 9, 1][axis];
+        edges[e] = CellEdge { from, to, start: Vec3::new(x as f32, y as f32, z as f32), direction: Vec3::AXES[axis] };
+        e += 1;
+    }
+    edges
+};
+
+/// The blocks of 2³ cells of a leaf along Morton's curve: those of each half, quarter and eighth of it follow each other.
+const BLOCKS: [IVec3; 64] = {
+    let mut blocks = [IVec3::ZERO; 64];
+    let mut i = 0;
+    while i < 64 {
+        let (high, low) = (i as i32 >> 3, i as i32 & 7);
+        blocks[i] =
+            IVec3::new((high >> 2) * 2 + (low >> 2), (high >> 1 & 1) * 2 + (low >> 1 & 1), (high & 1) * 2 + (low & 1));
+        i += 1;
+    }
+    blocks
+};
 
 /// The numbers of the vertices on the edges of a leaf's cells, by edge: made for one leaf after the other, so that cells
 /// look up nothing but this table.

@@ -6,13 +6,16 @@
 mod build;
 mod check;
 mod components;
+mod curvature;
 pub(crate) mod dual;
+mod field;
 pub(crate) mod isosurface;
 mod lattice;
 pub(crate) mod marching;
 mod measure;
 pub(crate) mod sample;
 pub mod shapes;
+mod sweep;
 #[cfg(test)]
 pub(crate) mod testing;
 mod union_find;
@@ -20,10 +23,13 @@ mod violation;
 
 use glam::{DVec3, IVec3};
 
-pub(crate) use build::grid_of_leaves;
+pub(crate) use build::{BYTES_A_LEAF, grid_of_leaves, grid_of_parts};
 pub use components::Components;
+pub use curvature::{CurvatureKind, curvature};
+pub use field::Field;
 pub use measure::Measures;
-pub use sample::Sampler;
+pub use sample::{Interpolation, Sampler};
+pub use sweep::{extend_field, sweep_distance};
 pub use violation::{Violation, ViolationKind};
 
 use crate::grid::{Grid, Transform};

@@ -8,18 +8,20 @@
 
 use glam::{DVec3, IVec3};
 
-use super::scatter::{distance_to_triangles, estimated_bytes};
-use super::{Bvh, MeshToLevelSet, TriangleMesh, level_set_to_mesh, mesh_to_level_set};
+use super::from_levelset::{leaves_the_band, surface_of};
+use super::nearest::{Band, leaves_of_band};
+use super::{Bvh, MeshToLevelSet, level_set_to_mesh, mesh_to_level_set};
 use crate::error::{EditError, Result};
-use crate::grid::{LEAF_VOXELS, LeafMask, Transform};
-use crate::levelset::{LevelSet, background, grid_of_leaves};
+use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, MAX_COORD, Transform};
+use crate::levelset::isosurface::IsoSurface;
+use crate::levelset::{BYTES_A_LEAF, LevelSet, background, grid_of_parts};
 use crate::run::RunOptions;
 
 const OPERATION: &str = "rebuild";
 
-/// Distances from the surface, in voxels, up to which every triangle is scattered into the band around it; beyond, voxels
-/// near the offset surface look for their closest triangle. A scattered band this wide costs about as much as the look-ups.
-const WIDEST_SCATTER: f64 = 12.0;
+/// Distances from the surface, in voxels, up to which the triangles near a tile of voxels are collected; beyond, each voxel looks
+/// its closest triangle up in a tree over all of them.
+const FARTHEST_IN_TILES: f64 = 64.0;
 
 /// What to rebuild.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -54,53 +56,47 @@ pub fn rebuild(level_set: &LevelSet, what: &Rebuild, run: &RunOptions) -> Result
     }
     let offset = offset / voxel_size;
     let reach = offset.abs() + f64::from(half_width);
-    let mesh = level_set_to_mesh(level_set, iso, run)?;
-    if mesh.triangles.is_empty() {
+    let surface = surface_of(level_set, iso, OPERATION, run)?;
+    if surface.is_torn() {
+        return Err(leaves_the_band(OPERATION, "between leaves"));
+    }
+    if surface.leaves().is_empty() {
         let mut none = LevelSet::empty(transform, half_width);
         none.grid_mut().combine_signs(level_set.grid(), |_, inside| inside);
         return Ok(none);
     }
-    let positions: Vec<DVec3> = mesh.positions.iter().map(|p| transform.world_to_index(*p)).collect();
-    let corners = |t: usize| mesh.triangles[t].map(|v| positions[v as usize]);
-    let count = mesh.triangles.len();
-    let field = level_set.grid();
-    if reach > WIDEST_SCATTER {
-        // Found out before the search: no surface at this distance outwards of anything has less area than a ball of that radius.
-        let least =
-            estimated_bytes(4.0 * std::f64::consts::PI * offset.max(0.0).powi(2), DVec3::splat(2.0 * reach), 0, 0.0);
-        run.reserve(OPERATION, least, "take a smaller distance")?;
-        let bvh = Bvh::new((0..count).map(corners).collect());
-        let bounds = index_bounds(&positions, reach)?;
-        let distance = |ijk: DVec3| {
-            let d = bvh.closest_point(ijk, f64::INFINITY).map_or(f64::INFINITY, |hit| hit.distance_squared.sqrt());
-            // At the centre of a block the nearest voxel tells the side; where that is in doubt, d is small.
-            let inside = field.voxel(ijk.round().as_ivec3()).0 < iso;
-            if inside { -d - offset } else { d - offset }
-        };
-        return LevelSet::from_distance(transform, half_width, bounds, distance, run);
+    let bounds = index_bounds(&surface, level_set.grid(), reach)?;
+    if reach > FARTHEST_IN_TILES {
+        drop(surface);
+        return from_tree(level_set, what, bounds, run);
     }
-    let needed = estimated_bytes(area(&positions, &mesh), extent(&positions), count, reach);
-    run.reserve(OPERATION, needed, "take a narrower band or a smaller distance")?;
     let background = background(half_width, &transform);
-    let leaves = distance_to_triangles(count, corners, reach as f32, run)?
-        .into_iter()
-        .filter_map(|leaf| {
-            let mut values = leaf.distance;
-            let mut active = LeafMask::EMPTY;
-            let inside = field.values(field.find(leaf.origin));
-            for at in 0..LEAF_VOXELS {
-                let d = f64::from(values.0[at]);
-                let signed = if inside.0[at] < iso { -d - offset } else { d - offset };
-                let phi = (signed * voxel_size) as f32;
-                // What lies beyond the scattered band is farther than the new one reaches.
-                let known = values.0[at] < reach as f32;
-                active.set(at, known && phi.abs() < background);
-                values.0[at] = if active.get(at) { phi } else { background.copysign(phi) };
-            }
-            (!active.is_empty()).then_some((leaf.origin, values, active))
-        })
-        .collect();
-    Ok(LevelSet::new(grid_of_leaves(background, leaves), transform))
+    let band = Band { offset, half_width: f64::from(half_width), voxel_size, background };
+    let leaves = leaves_of_band(OPERATION, &surface, level_set.grid(), iso, band, run)?;
+    Ok(LevelSet::new(grid_of_parts(background, &leaves), transform))
+}
+
+/// The same by looking up the closest triangle in a tree, voxel by voxel.
+fn from_tree(level_set: &LevelSet, what: &Rebuild, bounds: (IVec3, IVec3), run: &RunOptions) -> Result<LevelSet> {
+    let transform = *level_set.transform();
+    let Rebuild { half_width, iso, offset } = *what;
+    let offset = offset / transform.voxel_size();
+    // Found out before the search: no surface at this distance outwards of anything has less area than a ball of that radius.
+    let area = 4.0 * std::f64::consts::PI * offset.max(0.0).powi(2);
+    let leaves = area * 2.0 * f64::from(half_width) / LEAF_VOXELS as f64;
+    run.reserve(OPERATION, leaves as u64 * BYTES_A_LEAF, "take a smaller distance")?;
+    let mesh = level_set_to_mesh(level_set, iso, run)?;
+    let positions: Vec<DVec3> = mesh.positions.iter().map(|p| transform.world_to_index(*p)).collect();
+    let corners = |triangle: &[u32; 3]| triangle.map(|v| positions[v as usize]);
+    let bvh = Bvh::new(mesh.triangles.iter().map(corners).collect());
+    let field = level_set.grid();
+    let distance = |ijk: DVec3| {
+        let d = bvh.closest_point(ijk, f64::INFINITY).map_or(f64::INFINITY, |hit| hit.distance_squared.sqrt());
+        // At the centre of a block the nearest voxel tells the side; where that is in doubt, d is small.
+        let inside = field.voxel(ijk.round().as_ivec3()).0 < iso;
+        if inside { -d - offset } else { d - offset }
+    };
+    LevelSet::from_distance(transform, half_width, bounds, distance, run)
 }
 
 /// The level set on another lattice, with exact distances to its polygonised surface; voxels that coincide are copied.
@@ -136,10 +132,12 @@ pub fn with_half_width(level_set: &LevelSet, half_width: f32, run: &RunOptions) 
     }
 }
 
-fn index_bounds(positions: &[DVec3], reach: f64) -> Result<(IVec3, IVec3)> {
-    let (lo, hi) = bounds(positions);
-    let (lo, hi) = (lo - reach - 1.0, hi + reach + 1.0);
-    let limit = f64::from(crate::grid::MAX_COORD);
+/// Voxels around all that is within `reach` of a surface.
+fn index_bounds(surface: &IsoSurface, field: &Grid, reach: f64) -> Result<(IVec3, IVec3)> {
+    let origins = || surface.leaves().iter().map(|leaf| field.origin(leaf.id));
+    let lo = origins().fold(IVec3::MAX, IVec3::min).as_dvec3() - reach - 1.0;
+    let hi = (origins().fold(IVec3::MIN, IVec3::max) + LEAF_DIM).as_dvec3() + reach + 1.0;
+    let limit = f64::from(MAX_COORD);
     if lo.abs().max(hi.abs()).max_element() > limit {
         return Err(EditError::parameter(
             OPERATION,
@@ -151,16 +149,147 @@ fn index_bounds(positions: &[DVec3], reach: f64) -> Result<(IVec3, IVec3)> {
     Ok((lo.floor().as_ivec3(), hi.ceil().as_ivec3()))
 }
 
-fn bounds(positions: &[DVec3]) -> (DVec3, DVec3) {
-    positions.iter().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), p| (lo.min(*p), hi.max(*p)))
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::grid::LeafMask;
+    use crate::levelset::testing::{ball, block, box_distance, noise, sampled, torus};
+    use crate::stencil::simd::{Isa, choose};
 
-fn extent(positions: &[DVec3]) -> DVec3 {
-    let (lo, hi) = bounds(positions);
-    hi - lo
-}
+    /// Holds every `step`th voxel around the result against the nearest triangle of the polygons and the sign of the field.
+    fn check(level_set: &LevelSet, what: Rebuild, step: usize) {
+        let rebuilt = rebuild(level_set, &what, &RunOptions::default()).unwrap();
+        let mesh = level_set_to_mesh(level_set, what.iso, &RunOptions::default()).unwrap();
+        let transform = level_set.transform();
+        let voxel_size = level_set.voxel_size();
+        let bvh =
+            Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t).map(|p| transform.world_to_index(p))).collect());
+        let surface = IsoSurface::new(level_set.grid(), what.iso, "test", &RunOptions::default()).unwrap();
+        let half_width = f64::from(what.half_width);
+        let (lo, hi) = index_bounds(&surface, level_set.grid(), what.offset.abs() / voxel_size + half_width).unwrap();
+        let mut accessor = rebuilt.grid().accessor();
+        for x in (lo.x..=hi.x).step_by(step) {
+            for y in (lo.y..=hi.y).step_by(step) {
+                for z in (lo.z..=hi.z).step_by(step) {
+                    let ijk = IVec3::new(x, y, z);
+                    let unsigned = bvh.closest_point(ijk.as_dvec3(), f64::INFINITY).unwrap().distance_squared.sqrt();
+                    let inside = level_set.grid().voxel(ijk).0 < what.iso;
+                    let truth = if inside { -unsigned } else { unsigned } - what.offset / voxel_size;
+                    let truth_in_band = truth.clamp(-half_width, half_width);
+                    let value = f64::from(accessor.value(ijk)) / voxel_size;
+                    // Rounding in f32 grows with the distance from the surface.
+                    let tolerance = 1e-6 * (1.0 + unsigned);
+                    assert!((value - truth_in_band).abs() < tolerance, "{what:?} {ijk}: {value} {truth}");
+                    if (truth.abs() - half_width).abs() > tolerance {
+                        assert_eq!(accessor.is_active(ijk), truth.abs() < half_width, "{what:?} {ijk}");
+                    }
+                }
+            }
+        }
+    }
 
-fn area(positions: &[DVec3], mesh: &TriangleMesh) -> f64 {
-    let at = |v: u32| positions[v as usize];
-    mesh.triangles.iter().map(|&[a, b, c]| (at(b) - at(a)).cross(at(c) - at(a)).length() / 2.0).sum()
+    fn moved(half_width: f32, offset: f64) -> Rebuild {
+        Rebuild { offset, ..Rebuild::band(half_width) }
+    }
+
+    /// A thin plate, a ball beside it and a box that touches neither.
+    fn parts() -> LevelSet {
+        sampled(40, |p| {
+            let plate = box_distance(p, DVec3::new(14.0, 13.0, 0.4));
+            let ball = (p - DVec3::new(3.0, 2.0, 11.3)).length() - 6.2;
+            let corner = box_distance(p + DVec3::new(20.0, 21.0, 18.5), DVec3::splat(5.3));
+            plate.min(ball).min(corner)
+        })
+    }
+
+    #[test]
+    fn bands_of_any_width_are_exact() {
+        for half_width in [1.5, 3.0, 7.0, 20.0] {
+            check(&parts(), Rebuild::band(half_width), 1 + half_width as usize / 4);
+            check(&torus(14.0, 5.0), Rebuild::band(half_width), 1 + half_width as usize / 4);
+        }
+        check(&ball(DVec3::new(0.3, -0.2, 0.1), 12.0), Rebuild { iso: -1.25, ..Rebuild::band(4.0) }, 1);
+    }
+
+    #[test]
+    fn fields_that_are_no_distance_are_exact() {
+        for (seed, inside) in [(1, 0.02), (2, 0.3), (3, 0.5), (4, 0.97)] {
+            let field = noise(3, seed, inside);
+            for half_width in [1.5, 3.0, 9.0] {
+                check(&field, Rebuild::band(half_width), 1);
+            }
+            check(&field, moved(3.0, 4.0), 1);
+        }
+        // Signs alone: all vertices in the middle of an edge or, with values of 0, beside a voxel.
+        for outside in [0.0, 0.5, f32::INFINITY] {
+            check(
+                &block(3, |ijk| if (ijk - 12).abs().max_element() < 7 { -0.5 } else { outside }),
+                Rebuild::band(5.0),
+                1,
+            );
+        }
+    }
+
+    #[test]
+    fn offsets_are_exact_on_both_sides() {
+        for offset in [1.0, -1.0, 2.5, -4.0, 9.0, -9.5, 17.0, 40.0] {
+            check(&parts(), moved(3.0, offset), 1 + offset.abs() as usize / 4);
+        }
+        for offset in [-2.0, -11.0, 40.0, 70.0] {
+            check(&ball(DVec3::new(0.3, -0.2, 0.1), 12.0), moved(1.5, offset), 1 + offset.abs() as usize / 4);
+        }
+        assert!(rebuild(&parts(), &moved(3.0, -20.0), &RunOptions::default()).unwrap().is_empty());
+    }
+
+    #[test]
+    fn far_from_the_origin_is_as_exact() {
+        let centre = DVec3::new(1e6 + 0.123, -2e7 - 0.4, 3e5);
+        let voxel = centre.as_ivec3();
+        let ball = LevelSet::from_distance(
+            Transform::uniform(0.1),
+            3.0,
+            (voxel - 20, voxel + 20),
+            |p| (p - centre).length() - 9.0,
+            &RunOptions::default(),
+        );
+        check(&ball.unwrap(), moved(4.0, 0.35), 1);
+    }
+
+    #[test]
+    fn threads_and_instructions_do_not_change_a_bit() {
+        let level_set = parts();
+        let on = |threads, isa| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let before = choose(isa);
+            let result = pool.install(|| rebuild(&level_set, &moved(3.0, 2.5), &RunOptions::default()).unwrap());
+            choose(before);
+            let grid = result.into_grid();
+            grid.leaves()
+                .iter()
+                .map(|&id| (grid.origin(id), grid.mask(id), grid.values(id).0.map(f32::to_bits)))
+                .collect::<Vec<_>>()
+        };
+        let expected = on(1, Isa::Portable);
+        assert!(expected == on(1, Isa::Avx512) && expected == on(3, Isa::Avx2));
+        assert!(expected.iter().any(|(_, mask, _)| *mask != LeafMask::EMPTY));
+    }
+
+    #[test]
+    fn refusals() {
+        let ball = ball(DVec3::ZERO, 20.0);
+        let mut limited = RunOptions::default();
+        limited.memory_limit = Some(2_000_000);
+        let small = rebuild(&ball, &Rebuild::band(3.0), &limited);
+        assert!(small.is_ok(), "{:?}", small.err());
+        assert_eq!(rebuild(&ball, &Rebuild::band(20.0), &limited).err().unwrap().exit_code(), 5);
+        assert_eq!(rebuild(&ball, &moved(3.0, 1000.0), &limited).err().unwrap().exit_code(), 5);
+        assert_eq!(rebuild(&ball, &moved(3.0, 2e9), &limited).err().unwrap().exit_code(), 2);
+        let cancelled = RunOptions::default();
+        cancelled.cancel_flag().store(true, std::sync::atomic::Ordering::Relaxed);
+        assert_eq!(rebuild(&ball, &Rebuild::band(3.0), &cancelled).err().unwrap().exit_code(), 130);
+        // Space of both signs that meets without any leaf between.
+        let mut torn = sampled(24, |p| p.length() - 12.0);
+        torn.grid_mut().set_sign(IVec3::new(16, 16, 0), IVec3::new(24, 24, 8), true);
+        assert_eq!(rebuild(&torn, &Rebuild::band(3.0), &RunOptions::default()).err().unwrap().exit_code(), 3);
+    }
 }

@@ -92,7 +92,7 @@ impl Operator for Renormalize {
         let mut tracker = pde::Tracker::new(&mut level_set, None, solver, run);
         tracker.renormalize()?;
         // Voxels at the rim may have been found to lie beyond it.
-        tracker.trim_band();
+        tracker.trim_band()?;
         Ok(Outcome { level_set, summary: Summary { steps: Some(self.iterations), ..Summary::default() } })
     }
 }

@@ -44,6 +44,7 @@ impl From<&Report> for Summary {
             StopReason::Iterations => "all steps were taken",
             StopReason::Time => "the time was reached",
             StopReason::NothingLeft => "nothing was left to move",
+            StopReason::AtRest => "nothing moves any more",
         };
         Self { steps: Some(report.steps), stopped_because: Some(reason.into()), ..Self::default() }
     }

@@ -1,7 +1,7 @@
 //! Which voxels a step may write: everything, or what a region touches.
 
-use crate::grid::{Grid, LeafId, LeafMask, LeafSet, Paged};
-use crate::region::RegionWeights;
+use crate::grid::{Grid, LeafId, LeafMask, LeafSet, Paged, Transform};
+use crate::region::{Region, RegionWeights};
 
 /// The leaves that a flow works on and, with a region, its weights and the voxels that must keep their bits.
 pub(super) struct Domain {
@@ -11,7 +11,7 @@ pub(super) struct Domain {
 
 struct Local {
     weights: RegionWeights,
-    /// Voxels that were active at the start and have weight 0.
+    /// Of the leaves worked on, the voxels that were active at the start and have weight 0.
     frozen: Paged<LeafMask>,
 }
 
@@ -24,8 +24,8 @@ impl Domain {
     /// The leaves that a region touches.
     pub fn region(grid: &Grid, weights: RegionWeights) -> Self {
         let mut frozen = Paged::filled(grid.value_pages().page_count(), LeafMask::EMPTY);
-        frozen.par_update(grid.leaf_set(), |id, frozen: &mut LeafMask| {
-            *frozen = grid.mask(id).zip(positive(&weights, id), |active, moves| active & !moves);
+        frozen.par_update(weights.leaves(), |id, frozen: &mut LeafMask| {
+            *frozen = grid.mask(id).zip(weights.positive(id), |active, moves| active & !moves);
         });
         Self { leaves: weights.leaves().clone(), local: Some(Local { weights, frozen }) }
     }
@@ -45,9 +45,11 @@ impl Domain {
         self.local.as_ref().map(|l| &l.weights)
     }
 
-    /// The weights, to be extended.
-    pub fn weights_mut(&mut self) -> Option<&mut RegionWeights> {
-        self.local.as_mut().map(|l| &mut l.weights)
+    /// Looks up the weights of voxels that became active.
+    pub fn weigh(&mut self, grid: &Grid, transform: &Transform, region: &dyn Region) {
+        if let Some(local) = &mut self.local {
+            local.weights.evaluate(grid, transform, region, &self.leaves);
+        }
     }
 
     /// Of the active voxels of a leaf, those that a flow moves: weight above 0.
@@ -55,7 +57,7 @@ impl Domain {
     pub fn moving(&self, id: LeafId, active: LeafMask) -> LeafMask {
         match &self.local {
             None => active,
-            Some(local) => active.zip(positive(&local.weights, id), |a, moves| a & moves),
+            Some(local) => active.zip(local.weights.positive(id), |a, moves| a & moves),
         }
     }
 
@@ -68,13 +70,26 @@ impl Domain {
         }
     }
 
-    /// Takes leaves into the domain: new ones of the grid, or old ones that got new voxels.
-    pub fn include(&mut self, leaves: &[LeafId], pages: usize) {
+    /// Takes in new leaves of a grid.
+    pub fn include_new(&mut self, grid: &Grid, leaves: &[LeafId]) {
         for &id in leaves {
             self.leaves.insert(id);
         }
         if let Some(local) = &mut self.local {
+            let pages = grid.value_pages().page_count();
             local.frozen.grow(pages, LeafMask::EMPTY);
+            local.weights.grow(pages);
+            leaves.iter().for_each(|&id| *local.frozen.get_mut(id) = LeafMask::EMPTY);
+        }
+    }
+
+    /// Takes in leaves of a grid that have not been worked on before: what is active in them was so at the start.
+    pub fn include_old(&mut self, grid: &Grid, leaves: &[LeafId]) {
+        for &id in leaves {
+            self.leaves.insert(id);
+        }
+        if let Some(local) = &mut self.local {
+            leaves.iter().for_each(|&id| *local.frozen.get_mut(id) = grid.mask(id));
         }
     }
 
@@ -83,15 +98,8 @@ impl Domain {
         for &id in leaves {
             self.leaves.remove(id);
         }
+        if let Some(local) = &mut self.local {
+            local.weights.forget(leaves);
+        }
     }
-}
-
-/// Where the weight is above 0.
-#[inline(always)]
-fn positive(weights: &RegionWeights, id: LeafId) -> LeafMask {
-    if !weights.leaves().contains(id) {
-        return LeafMask::EMPTY;
-    }
-    let alpha = &weights.alpha(id).0;
-    LeafMask(std::array::from_fn(|x| (0..64).fold(0, |word, bit| word | u64::from(alpha[x * 64 + bit] > 0.0) << bit)))
 }

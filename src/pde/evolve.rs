@@ -26,6 +26,8 @@ pub enum StopReason {
     Time,
     /// The surface vanished, or the region touches nothing.
     NothingLeft,
+    /// The speed is 0 everywhere.
+    AtRest,
 }
 
 /// What a flow did.
@@ -44,53 +46,93 @@ pub struct Report {
 /// Most steps of one flow: a time that needs more was meant otherwise.
 const MOST_STEPS: f64 = 1e6;
 
+/// What the time loop drives.
+pub(super) trait Motion {
+    /// Looks at the field and returns the next time step, at most `left`; `None` if nothing moves any more.
+    fn prepare(&mut self, tracker: &Tracker, left: f64) -> Option<f64>;
+
+    /// Moves the surface by that time step.
+    fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()>;
+}
+
+/// The time loop: steps and tracks until it is time to stop.
+pub(super) fn drive(tracker: &mut Tracker, motion: &mut impl Motion, until: Until) -> Result<Report> {
+    let (most, end) = match until {
+        Until::Iterations(n) => (n, f64::INFINITY),
+        Until::Time(t) if t >= 0.0 && t.is_finite() => (u32::MAX, t),
+        Until::Time(t) => return Err(EditError::parameter("evolve", "time", t, "0 or more")),
+    };
+    let run = tracker.run;
+    let mut task = None;
+    let mut report = Report {
+        steps: 0,
+        time: 0.0,
+        voxels: tracker.moving_voxels(),
+        stopped: if end.is_finite() { StopReason::Time } else { StopReason::Iterations },
+    };
+    while report.steps < most && report.time < end {
+        if report.voxels == 0 {
+            report.stopped = StopReason::NothingLeft;
+            break;
+        }
+        let left = end - report.time;
+        let Some(dt) = motion.prepare(tracker, left) else {
+            report.stopped = StopReason::AtRest;
+            break;
+        };
+        if end.is_finite() && left / dt > MOST_STEPS {
+            let accepted = format!("0 to {} at this voxel size", dt * MOST_STEPS);
+            return Err(EditError::parameter("evolve", "time", end, accepted));
+        }
+        let steps_left = if end.is_finite() { (left / dt).ceil() as u32 } else { most - report.steps };
+        let task = task.get_or_insert_with(|| run.task("evolving", u64::from(steps_left)));
+        motion.step(tracker, dt)?;
+        tracker.track()?;
+        report.steps += 1;
+        // Not the sum of the steps, which rounding may leave short of the end.
+        report.time = if dt == left { end } else { report.time + dt };
+        report.voxels = tracker.moving_voxels();
+        task.advance(1);
+    }
+    Ok(report)
+}
+
 /// Moves a surface by φ_t = −F|∇φ|, everywhere or weighted by a region, tracking the band after each step.
 pub fn evolve(
     level_set: &mut LevelSet,
-    function: &dyn SpeedFunction,
+    function: &impl SpeedFunction,
     region: Option<&dyn Region>,
     until: Until,
     solver: &SolverOptions,
     run: &RunOptions,
 ) -> Result<Report> {
-    let largest = function.largest_step(level_set.voxel_size());
-    let (steps, dt) = match until {
-        Until::Iterations(n) => (n, largest),
-        Until::Time(t) => {
-            if !(t >= 0.0 && t / largest <= MOST_STEPS) {
-                return Err(EditError::parameter(
-                    "evolve",
-                    "time",
-                    t,
-                    format!("0 to {} at this voxel size", largest * MOST_STEPS),
-                ));
-            }
-            let steps = (t / largest).ceil();
-            (steps as u32, if steps > 0.0 { t / steps } else { 0.0 })
-        }
-    };
-    let voxel_size = level_set.voxel_size() as f32;
+    let voxel_size = level_set.voxel_size();
     let mut tracker = Tracker::new(level_set, region, *solver, run);
-    let task = run.task("evolving", u64::from(steps));
-    let step = FlowStep { function, dt: dt as f32, voxel_size };
-    let mut report = Report {
-        steps: 0,
-        time: 0.0,
-        voxels: tracker.moving_voxels(),
-        stopped: if matches!(until, Until::Time(_)) { StopReason::Time } else { StopReason::Iterations },
-    };
-    for n in 0..steps {
-        if report.voxels == 0 {
-            report.stopped = StopReason::NothingLeft;
-            break;
+    drive(&mut tracker, &mut Flow { function, voxel_size }, until)
+}
+
+/// Part of a step by which a time may exceed a whole number of steps without one more.
+const WHOLE_STEPS: f64 = 1e-9;
+
+/// The motion that a speed function describes.
+struct Flow<'a, F> {
+    function: &'a F,
+    voxel_size: f64,
+}
+
+impl<F: SpeedFunction> Motion for Flow<'_, F> {
+    fn prepare(&mut self, _: &Tracker, left: f64) -> Option<f64> {
+        let largest = self.function.largest_step(self.voxel_size);
+        if left.is_infinite() {
+            return Some(largest);
         }
-        // Flows of curvature are first order in time: dt is bounded by stability, not by accuracy.
-        tracker.integrate(&step, TimeIntegrator::TvdRk1, Target::Moving)?;
-        tracker.track()?;
-        report.steps = n + 1;
-        report.time = f64::from(report.steps) * dt;
-        report.voxels = tracker.moving_voxels();
-        task.advance(1);
+        // Equal parts of the time, as few as may be. Rounding of the sum of steps must not make it one more.
+        Some(left / (left / largest - WHOLE_STEPS).ceil().max(1.0))
     }
-    Ok(report)
+
+    fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
+        let step = FlowStep { function: self.function, dt: dt as f32, voxel_size: self.voxel_size as f32 };
+        // Flows of curvature are first order in time: dt is bounded by stability, not by accuracy.
+        tracker.integrate(&step, TimeIntegrator::TvdRk1, Target::Moving)
+    }
 }

@@ -1,10 +1,13 @@
 //! Partial differential equations on the narrow band: the only time loop in the house.
 //!
-//! [`evolve`] moves a surface with a [`SpeedFunction`]; [`renormalize`] restores |∇φ| = 1; [`track`] lets the band follow
+//! [`evolve`] moves a surface with a [`SpeedFunction`], [`morph_towards`] towards another one; [`filter()`] smooths the field; [`renormalize`] restores
+//! |∇φ| = 1; [`track`] lets the band follow
 //! the surface: dilate, renormalise, trim. A [`Tracker`] does these steps one by one.
 
 mod domain;
 mod evolve;
+mod filter;
+mod morph;
 mod renormalize;
 mod speed;
 mod step;
@@ -12,8 +15,10 @@ mod track;
 mod tracker;
 
 pub use evolve::{Report, StopReason, Until, evolve};
+pub use filter::{Filter, FilterKind, filter, offset};
+pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
-pub use speed::{GradientNorm, LeafFields, SpeedFunction, WantedFields};
+pub use speed::SpeedFunction;
 pub use track::track;
 pub use tracker::Tracker;
 

@@ -16,7 +16,7 @@ use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 use crate::stencil::simd::Lanes;
 use crate::stencil::upwind::{UpwindScheme, WenoEpsilon, godunov_first, godunov_weno5};
-use crate::stencil::{Halo, StarHalo};
+use crate::stencil::{FaceHalo, StarHalo};
 
 /// Renormalises the whole band `solver.normalizations` times. The band itself stays as it is.
 pub fn renormalize(level_set: &mut LevelSet, solver: &SolverOptions, run: &RunOptions) -> Result<()> {
@@ -26,6 +26,11 @@ pub fn renormalize(level_set: &mut LevelSet, solver: &SolverOptions, run: &RunOp
 impl Tracker<'_> {
     /// Renormalises the domain `solver.normalizations` times.
     pub fn renormalize(&mut self) -> Result<()> {
+        self.renormalize_to(Target::Repairable)
+    }
+
+    /// Renormalises the domain `solver.normalizations` times, the last time with target `last`.
+    pub(super) fn renormalize_to(&mut self, last: Target) -> Result<()> {
         let SolverOptions { scheme, integrator, normalizations, weno_epsilon } = self.solver;
         let voxel_size = self.voxel_size();
         // The steps of OpenVDB's LevelSetTracker: the largest that stay stable with each scheme.
@@ -35,13 +40,36 @@ impl Tracker<'_> {
             TimeIntegrator::TvdRk3 => 1.0,
         };
         let step = RenormalizationStep { dt: courant * voxel_size, voxel_size };
-        for _ in 0..normalizations {
+        for n in 1..=normalizations {
+            let target = if n == normalizations { last } else { Target::Repairable };
             match scheme {
-                UpwindScheme::First => self.integrate(&FirstOrder(step), integrator, Target::Repairable)?,
-                UpwindScheme::HjWeno5 => self.integrate(&Weno5(step, weno_epsilon), integrator, Target::Repairable)?,
+                UpwindScheme::First => self.integrate(&FirstOrder(step), integrator, target)?,
+                UpwindScheme::HjWeno5 => self.integrate(&Weno5(step, weno_epsilon), integrator, target)?,
             }
         }
+        if normalizations == 0 && last == Target::Trimmed {
+            self.trim_band()?;
+        }
         Ok(())
+    }
+
+    /// Deactivates the voxels of the domain that lie outside the band, sets them to ±background, and removes empty leaves.
+    pub fn trim_band(&mut self) -> Result<()> {
+        self.integrate(&Unchanged, TimeIntegrator::TvdRk1, Target::Trimmed)
+    }
+}
+
+/// No renormalisation: trimming alone.
+struct Unchanged;
+
+impl LeafKernel for Unchanged {
+    type Scratch = ();
+
+    fn scratch(&self) {}
+
+    #[inline(always)]
+    fn euler<S: Simd>(&self, _: S, grid: &Grid, id: LeafId, _: LeafMask, (): &mut (), out: &mut LeafValues) {
+        out.0 = grid.values(id).0;
     }
 }
 
@@ -65,21 +93,29 @@ impl RenormalizationStep {
 struct FirstOrder(RenormalizationStep);
 
 impl LeafKernel for FirstOrder {
-    type Scratch = Halo;
+    type Scratch = FaceHalo;
 
-    fn scratch(&self) -> Halo {
-        Halo::new()
+    fn scratch(&self) -> FaceHalo {
+        FaceHalo::new()
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, halo: &mut Halo, out: &mut LeafValues) {
+    fn euler<S: Simd>(
+        &self,
+        simd: S,
+        grid: &Grid,
+        id: LeafId,
+        rows: LeafMask,
+        halo: &mut FaceHalo,
+        out: &mut LeafValues,
+    ) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         rows.for_each_pair(
             #[inline(always)]
             |x, y, _| {
                 let at = x * 64 + y * 8;
-                let phi = halo.rows(simd, x, y, [0; 3]);
-                self.0.euler(simd, phi, godunov_first(simd, halo, x, y)).store_slice(&mut out.0[at..at + 16]);
+                let phi = halo.centre(simd, x, y);
+                self.0.euler(simd, phi, godunov_first(simd, halo, x, y, phi)).store_slice(&mut out.0[at..at + 16]);
             },
         );
     }
@@ -111,7 +147,7 @@ impl LeafKernel for Weno5 {
                 let at = x * 64 + y * 8;
                 let phi = halo.centre(simd, x, y);
                 self.0
-                    .euler(simd, phi, godunov_weno5(simd, halo, x, y, self.0.voxel_size, self.1))
+                    .euler(simd, phi, godunov_weno5(simd, halo, x, y, phi, self.0.voxel_size, self.1))
                     .store_slice(&mut out.0[at..at + 16]);
             },
         );

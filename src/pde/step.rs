@@ -2,7 +2,7 @@
 //!
 //! Masks and regions are handled here and nowhere else.
 
-use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
 
 use super::domain::Domain;
 use super::tracker::Tracker;
@@ -18,7 +18,7 @@ pub(super) trait LeafKernel: Sync {
     fn scratch(&self) -> Self::Scratch;
 
     /// Computes φ + dt·L(φ) for the row pairs of leaf `id` that have a bit in `rows`; the others of `out` are not read.
-    /// Must be `#[inline(always)]`.
+    /// Reads values and neighbours of the grid, not its masks. Must be `#[inline(always)]`.
     fn euler<S: Simd>(
         &self,
         simd: S,
@@ -37,6 +37,8 @@ pub(super) enum Target {
     Moving,
     /// Active voxels but the frozen ones: repair of the distance.
     Repairable,
+    /// As `Repairable`; those that end outside the band are deactivated and set to ±background. The last step of a track.
+    Trimmed,
 }
 
 /// result = old·φₙ + new·E(φ).
@@ -51,8 +53,17 @@ impl Blend {
     pub const NEW: Self = Self { old: 0.0, new: 1.0 };
 }
 
+/// What trimming a leaf leaves to be done.
+pub(super) struct Emptied {
+    pub id: LeafId,
+    /// Row pairs without an active voxel whose values differ from those before the step, bit `4x + y/2` each.
+    pub pairs: u32,
+}
+
 impl Tracker<'_> {
     /// Steps φ into buffer `to`. The old value φₙ of the blend is read from buffer `from`, or from `to` itself.
+    ///
+    /// Returns the rows that trimming emptied, sorted by leaf.
     pub(super) fn step_into(
         &mut self,
         kernel: &impl LeafKernel,
@@ -60,19 +71,52 @@ impl Tracker<'_> {
         from: Option<usize>,
         to: usize,
         blend: Blend,
-    ) {
+    ) -> Vec<Emptied> {
         let mut out = std::mem::take(&mut self.buffers[to]);
+        // Its masks are lent to the tasks, page by page.
+        let mut masks = if target == Target::Trimmed { self.grid.take_masks() } else { Paged::default() };
+        let several_buffers = self.buffers.len() > 1;
         let old = from.map(|i| &self.buffers[i]);
         let (grid, domain, run) = (&*self.grid, &self.domain, self.run);
         // All tasks read the neighbours: computed before they start, not by the first of them.
         grid.neighbours();
-        out.par_update_pages(domain.leaves(), |leaves, page| {
+        if blend.old != 0.0 && old.is_none() {
+            // The old values are read from the pages that are written.
+            out.own_pages(domain.leaves());
+        }
+        let step = |leaves, new_page, page: &mut [LeafValues], masks: Option<&mut [LeafMask]>| {
+            let mut emptied = Vec::new();
             // One check a page of 64 leaves: a cancelled run stops within a fraction of a step.
             if !run.is_cancelled() {
-                simd::dispatch(PageStep { kernel, grid, domain, target, old, blend, leaves, page });
+                let emptied = &mut emptied;
+                simd::dispatch(PageStep {
+                    kernel,
+                    grid,
+                    domain,
+                    target,
+                    old,
+                    blend,
+                    leaves,
+                    new_page,
+                    page,
+                    masks,
+                    several_buffers,
+                    emptied,
+                });
             }
-        });
+            emptied
+        };
+        let mut emptied = Vec::new();
+        if target == Target::Trimmed {
+            emptied = out.par_rewrite_pages_with(&mut masks, domain.leaves(), |leaves, new, page, masks| {
+                step(leaves, new, page, Some(masks))
+            });
+            self.grid.restore_masks(masks);
+        } else {
+            out.par_rewrite_pages(domain.leaves(), |leaves, new, page| drop(step(leaves, new, page, None)));
+        }
         self.buffers[to] = out;
+        emptied.into_iter().flatten().collect()
     }
 }
 
@@ -85,25 +129,35 @@ struct PageStep<'a, K> {
     old: Option<&'a Paged<LeafValues>>,
     blend: Blend,
     leaves: PageLeaves,
+    /// Whether the page holds anything but the values that a step into it relies on.
+    new_page: bool,
     page: &'a mut [LeafValues],
+    /// The masks of the page, if the step trims.
+    masks: Option<&'a mut [LeafMask]>,
+    /// Whether other buffers than φ and this one are to be kept in step.
+    several_buffers: bool,
+    emptied: &'a mut Vec<Emptied>,
 }
 
 impl<K: LeafKernel> Work for PageStep<'_, K> {
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(mut self, simd: S) {
         let mut scratch = self.kernel.scratch();
         let mut new = LeafValues::default();
+        let background = Lanes::splat(simd, self.grid.background());
+        let several = self.several_buffers;
         self.leaves.for_each(
             #[inline(always)]
             |id| {
                 let out = &mut self.page[PageLeaves::slot(id)];
                 let phi = self.grid.values(id);
-                let active = self.grid.mask(id);
+                let mut mask = self.masks.as_mut().map(|masks| &mut masks[PageLeaves::slot(id)]);
+                let active = mask.as_ref().map_or_else(|| self.grid.mask(id), |mask| **mask);
                 let (write, alpha) = match self.target {
                     Target::Moving => (self.domain.moving(id, active), self.domain.weights().map(|w| w.alpha(id))),
-                    Target::Repairable => (self.domain.repairable(id, active), None),
+                    Target::Repairable | Target::Trimmed => (self.domain.repairable(id, active), None),
                 };
-                if self.domain.is_local() && self.blend.old == 0.0 {
+                if self.new_page || (self.domain.is_local() && self.blend.old == 0.0) {
                     // The buffer may hold an older state of voxels that this step does not write.
                     out.0 = phi.0;
                 }
@@ -111,25 +165,40 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
                     return;
                 }
                 self.kernel.euler(simd, self.grid, id, write, &mut scratch, &mut new);
+                let mut emptied = 0u32;
                 write.for_each_pair(
                     #[inline(always)]
                     |x, y, bits| {
                         let at = x * 64 + y * 8;
                         let mut value = load(simd, &new, at);
+                        let now = load(simd, phi, at);
                         if let Some(alpha) = alpha {
                             let a = load(simd, alpha, at);
-                            value = (Lanes::splat(simd, 1.0) - a) * load(simd, phi, at) + a * value;
+                            value = (Lanes::splat(simd, 1.0) - a) * now + a * value;
                         }
-                        let now = load(simd, phi, at);
                         if self.blend.old != 0.0 {
                             let old = load(simd, self.old.map_or(&*out, |buffer| buffer.get(id)), at);
                             value = old * self.blend.old + value * self.blend.new;
+                        }
+                        if let Some(mask) = &mut mask {
+                            let outside = value.abs().simd_ge(background);
+                            value = outside.select(background.copysign(value), value);
+                            let trimmed = outside.to_bitmask() & u64::from(bits);
+                            mask.0[x] &= !(trimmed << (8 * y));
+                            if mask.0[x] >> (8 * y) & 0xffff == 0
+                                && (several || value.simd_eq(now).to_bitmask() & u64::from(bits) != u64::from(bits))
+                            {
+                                emptied |= 1 << (4 * x + y / 2);
+                            }
                         }
                         // The other voxels of the rows take φ's value: so trimmed ones need no care of their own.
                         let mask = mask32x16::from_bitmask(simd, u64::from(bits));
                         mask.select(value, now).store_slice(&mut out.0[at..at + 16]);
                     },
                 );
+                if emptied != 0 || mask.is_some_and(|mask| mask.is_empty()) {
+                    self.emptied.push(Emptied { id, pairs: emptied });
+                }
             },
         );
     }

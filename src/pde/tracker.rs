@@ -1,13 +1,17 @@
 //! A level set on the move: the grid, its second buffers, the domain and how it is solved.
 
+use fearless_simd::Simd;
+use rayon::prelude::*;
+
 use super::domain::Domain;
 use super::step::{Blend, LeafKernel, Target};
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::Result;
-use crate::grid::{Grid, LeafValues, Paged, Transform};
+use crate::grid::{Grid, LeafValues, PageLeaves, Paged, Transform};
 use crate::levelset::LevelSet;
 use crate::region::{Region, RegionWeights};
 use crate::run::RunOptions;
+use crate::stencil::simd::{Work, dispatch};
 
 /// Steps a level set and keeps its band on the surface (OpenVDB's word for it).
 ///
@@ -53,7 +57,13 @@ impl<'a> Tracker<'a> {
 
     /// Active voxels that the domain lets move.
     pub fn moving_voxels(&self) -> u64 {
-        self.domain.leaves().iter().map(|id| u64::from(self.domain.moving(id, self.grid.mask(id)).count())).sum()
+        let (grid, domain) = (&*self.grid, &self.domain);
+        let count = |leaves| {
+            let mut voxels = 0;
+            dispatch(CountMoving { grid, domain, leaves, voxels: &mut voxels });
+            voxels
+        };
+        domain.leaves().par_pages().map(count).sum()
     }
 
     /// Exchanges φ with second buffer `i`.
@@ -79,20 +89,47 @@ impl<'a> Tracker<'a> {
         target: Target,
     ) -> Result<()> {
         self.need_buffers(if integrator == TimeIntegrator::TvdRk3 { 2 } else { 1 });
-        let mut euler = |from: Option<usize>, to: usize, blend: Blend| {
-            self.step_into(kernel, target, from, to, blend);
+        // Only the last stage trims.
+        let stage = if target == Target::Trimmed { Target::Repairable } else { target };
+        let mut euler = |target, from: Option<usize>, to: usize, blend: Blend| {
+            let emptied = self.step_into(kernel, target, from, to, blend);
             self.exchange(to);
+            emptied
         };
         // After an exchange the buffer just written is φ, and what was φ lies in its place.
-        euler(None, 0, Blend::NEW);
-        match integrator {
-            TimeIntegrator::TvdRk1 => {}
-            TimeIntegrator::TvdRk2 => euler(None, 0, Blend { old: 0.5, new: 0.5 }),
-            TimeIntegrator::TvdRk3 => {
-                euler(Some(0), 1, Blend { old: 0.75, new: 0.25 });
-                euler(None, 0, Blend { old: 1.0 / 3.0, new: 2.0 / 3.0 });
+        let emptied = match integrator {
+            TimeIntegrator::TvdRk1 => euler(target, None, 0, Blend::NEW),
+            TimeIntegrator::TvdRk2 => {
+                euler(stage, None, 0, Blend::NEW);
+                euler(target, None, 0, Blend { old: 0.5, new: 0.5 })
             }
+            TimeIntegrator::TvdRk3 => {
+                euler(stage, None, 0, Blend::NEW);
+                euler(stage, Some(0), 1, Blend { old: 0.75, new: 0.25 });
+                euler(target, None, 0, Blend { old: 1.0 / 3.0, new: 2.0 / 3.0 })
+            }
+        };
+        if target == Target::Trimmed {
+            self.settle(&emptied);
         }
         self.run.check("stepping the level set")
+    }
+}
+
+/// Counts the active voxels of a page that move. As vector work because bits are counted one by one otherwise.
+struct CountMoving<'a> {
+    grid: &'a Grid,
+    domain: &'a Domain,
+    leaves: PageLeaves,
+    voxels: &'a mut u64,
+}
+
+impl Work for CountMoving<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        self.leaves.for_each(
+            #[inline(always)]
+            |id| *self.voxels += u64::from(self.domain.moving(id, self.grid.mask(id)).count()),
+        );
     }
 }

@@ -20,6 +20,14 @@ pub trait Region: Send + Sync {
 
     /// World-space box outside which α is 0; `None` if there is none.
     fn bounds(&self) -> Option<(DVec3, DVec3)>;
+
+    /// Least and largest α that may occur in a ball; may be wider than what does. Where both are 0 or both are 1 the voxels of a leaf need no
+    /// look.
+    fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
+        let touched =
+            self.bounds().is_none_or(|(lo, hi)| (centre + radius).cmpge(lo).all() && (centre - radius).cmple(hi).all());
+        [0.0, f32::from(u8::from(touched))]
+    }
 }
 
 /// Museth's C¹ ramp P: 0 below 0, 2β² up to ½, 1 − 2(β − 1)² up to 1, then 1.
@@ -70,6 +78,18 @@ impl Region for Combined {
                 .reduce(|a, b| a.zip(b).map(|(a, b)| (a.0.min(b.0), a.1.max(b.1))))
                 .flatten(),
             Self::Not(_) => None,
+        }
+    }
+
+    fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
+        let of = |part: &dyn Region| part.weights_within(centre, radius);
+        match self {
+            Self::All(parts) => parts.iter().map(|p| of(&**p)).fold([1.0; 2], |a, b| [a[0] * b[0], a[1] * b[1]]),
+            Self::Any(parts) => parts.iter().map(|p| of(&**p)).fold([0.0; 2], |a, b| [a[0].max(b[0]), a[1].max(b[1])]),
+            Self::Not(part) => {
+                let [low, high] = of(&**part);
+                [1.0 - high, 1.0 - low]
+            }
         }
     }
 }

@@ -58,6 +58,17 @@ impl Shape {
         }
     }
 
+    /// Radius of a ball around the centre that lies in the shape: s changes by at most 1/radius a unit of length.
+    fn inner_radius(&self) -> f64 {
+        match *self {
+            Self::Sphere { radius } => radius,
+            Self::Box { half_size } => half_size.min_element(),
+            Self::Cylinder { radius, half_height } => radius.min(half_height),
+            // Exponents up to 2: the octahedron with the semi-axes lies in it.
+            Self::Superellipsoid { radii, .. } => 1.0 / radii.recip().length(),
+        }
+    }
+
     /// Half edges of the local box around the shape.
     fn extent(&self) -> DVec3 {
         match *self {
@@ -126,6 +137,13 @@ impl Region for Primitive {
         let reach = abs * extent;
         Some((self.centre - reach, self.centre + reach))
     }
+
+    fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
+        // s is the gauge of a convex body, so that it changes by at most one over the radius of a ball within. A little more for rounding.
+        let reach = radius / self.shape.inner_radius() * (1.0 + 1e-9) + 1e-9;
+        let s = self.shape.size_fraction(self.axes.transpose() * (centre - self.centre));
+        [f32::from(u8::from(s + reach < self.soft[0])), f32::from(u8::from(s - reach < self.soft[1]))]
+    }
 }
 
 #[cfg(test)]
@@ -161,6 +179,31 @@ mod tests {
             for (s, w) in [(0.5, 1.0), (0.9, 1.0), (0.95, 0.5), (1.0, 0.0), (1.5, 0.0)] {
                 assert!((region.weight(axis * s) - w).abs() < 1e-6, "{region:?} {s}");
             }
+        }
+    }
+
+    #[test]
+    fn no_weight_in_a_ball_is_beyond_its_limits() {
+        for shape in [
+            Shape::Sphere { radius: 2.0 },
+            Shape::Box { half_size: DVec3::new(1.0, 2.0, 3.0) },
+            Shape::Cylinder { radius: 2.0, half_height: 1.0 },
+            Shape::Superellipsoid { radii: DVec3::new(3.0, 2.0, 1.0), exponents: [0.2, 2.0] },
+            Shape::Superellipsoid { radii: DVec3::new(1.0, 1.0, 2.0), exponents: [2.0, 2.0] },
+        ] {
+            let region = at_origin(shape);
+            let at = |i: u32, k: u32| f64::from(i * k % 41) / 20.5 - 1.0;
+            let (mut all, mut none) = (0, 0);
+            for i in 0..400 {
+                let centre = DVec3::new(at(i, 7), at(i, 11), at(i, 17)) * 3.3;
+                let [low, high] = region.weights_within(centre, 0.3);
+                for k in 0..60 {
+                    let offset = DVec3::new(at(k, 3), at(k, 13), at(k, 19)).normalize_or_zero() * 0.3;
+                    assert!((low..=high).contains(&region.weight(centre + offset)), "{region:?} {centre}");
+                }
+                (all, none) = (all + u32::from(low == 1.0), none + u32::from(high == 0.0));
+            }
+            assert!(all > 0 && none > 40, "{region:?}: {all} {none}");
         }
     }
 

@@ -9,8 +9,8 @@
 
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 
-use super::Halo;
 use super::simd::Lanes;
+use super::{Halo, LeafHalo};
 
 /// Below this part of a voxel size, squared, a central difference counts as no gradient. A distance field has |Dφ| = 1 voxel size.
 const FLAT_SQUARED: f32 = 1e-12;
@@ -52,12 +52,9 @@ pub fn mean_curvature<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, voxel_s
 
 /// Laplacian: Δφ in 1/world.
 #[inline(always)]
-pub fn laplacian<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
-    macro_rules! at {
-        ($dx:expr, $dy:expr, $dz:expr) => {
-            halo.rows(simd, x, y, [$dx, $dy, $dz])
-        };
-    }
-    let sum = (at!(1, 0, 0) + at!(-1, 0, 0)) + (at!(0, 1, 0) + at!(0, -1, 0)) + (at!(0, 0, 1) + at!(0, 0, -1));
-    (sum - at!(0, 0, 0) * 6.0) * (1.0 / (voxel_size * voxel_size))
+pub fn laplacian<S: Simd>(simd: S, halo: &impl LeafHalo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
+    let ([xm, xp], [ym, yp], [zm, zp]) =
+        (halo.beside(simd, x, y, 0), halo.beside(simd, x, y, 1), halo.beside(simd, x, y, 2));
+    let sum = (xp + xm) + (yp + ym) + (zp + zm);
+    (sum - halo.centre(simd, x, y) * 6.0) * (1.0 / (voxel_size * voxel_size))
 }

@@ -12,6 +12,22 @@ use crate::grid::{LEAF_VOXELS, LeafValues, Neighbours, Paged};
 /// Eight voxels along z.
 pub type Row = [f32; 8];
 
+/// A leaf and the voxels around it that a stencil reads.
+pub trait LeafHalo: Default {
+    /// Copies the leaf in the middle of `around` and what belongs to its rim.
+    fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours);
+
+    /// Rows (x, y) and (x, y + 1) of the leaf.
+    fn centre<S: Simd>(&self, simd: S, x: usize, y: usize) -> Lanes<S>;
+
+    /// The rows one step before and one step after along `axis` (0 = x, 1 = y, 2 = z).
+    fn beside<S: Simd>(&self, simd: S, x: usize, y: usize, axis: usize) -> [Lanes<S>; 2];
+}
+
+/// A leaf and its 26 neighbours.
+const ALL: [usize; 27] =
+    [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26];
+
 /// A leaf with a rim of one voxel: for stencils over the 27 voxels around each.
 #[repr(align(64))]
 pub struct Halo {
@@ -28,6 +44,7 @@ impl Halo {
     /// Copies the leaf in the middle of `around` and the rim from its 26 neighbours.
     #[inline(always)]
     pub fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
+        let leaves = leaves(values, around, ALL);
         for x in 0..10 {
             // The neighbour in x, and the slab of it.
             let (i, from) = match x {
@@ -35,7 +52,7 @@ impl Halo {
                 9 => (2, 0),
                 _ => (1, x - 1),
             };
-            let leaf = |q: usize| slab(&values.get(around[i * 9 + q]).0, from);
+            let leaf = |q: usize| slab(leaves[i * 9 + q], from);
             let [low, middle, high] = &mut self.slabs;
             let slabs = &mut [&mut low[x], &mut middle[x], &mut high[x]];
             fill::<8>(slabs, 0, [&leaf(0)[56..], &leaf(1)[56..], &leaf(2)[56..]]);
@@ -76,43 +93,67 @@ impl Default for Halo {
     }
 }
 
-/// A leaf with what stencils of ±3 voxels along each axis read.
+impl LeafHalo for Halo {
+    #[inline(always)]
+    fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
+        Self::gather(self, values, around);
+    }
+
+    #[inline(always)]
+    fn centre<S: Simd>(&self, simd: S, x: usize, y: usize) -> Lanes<S> {
+        self.rows(simd, x, y, [0; 3])
+    }
+
+    #[inline(always)]
+    fn beside<S: Simd>(&self, simd: S, x: usize, y: usize, axis: usize) -> [Lanes<S>; 2] {
+        let (mut before, mut after) = ([0; 3], [0; 3]);
+        (before[axis], after[axis]) = (-1, 1);
+        [self.rows(simd, x, y, before), self.rows(simd, x, y, after)]
+    }
+}
+
+/// A leaf with what stencils of ±REACH voxels along each axis read, REACH 1 or 3.
 #[repr(align(64))]
-pub struct StarHalo {
+pub struct StarHalo<const REACH: usize = 3> {
     /// By x; fourteen rows of 8 along y.
     slabs: [[f32; 112]; 14],
-    /// The leaf's own rows by shift in z (−3, −2, −1, 1, 2, 3), then x.
+    /// The leaf's own rows by shift in z (−1, 1, −2, 2, −3, 3), then x.
     shifted: [[[f32; 64]; 8]; 6],
 }
 
-impl StarHalo {
+/// For stencils over the six face neighbours.
+pub type FaceHalo = StarHalo<1>;
+
+impl<const REACH: usize> StarHalo<REACH> {
     /// A buffer to gather into.
     pub fn new() -> Self {
         Self { slabs: [[0.0; 112]; 14], shifted: [[[0.0; 64]; 8]; 6] }
     }
 
-    /// Copies the leaf in the middle of `around` and the three voxels beyond each of its faces.
+    /// Copies the leaf in the middle of `around` and the voxels beyond each of its faces.
     #[inline(always)]
     pub fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
-        let leaf = |q: usize| &values.get(around[q]).0;
-        let centre = leaf(13);
-        for x in 0..3 {
-            self.slabs[x][24..88].copy_from_slice(&leaf(4)[(5 + x) * 64..][..64]);
-            self.slabs[11 + x][24..88].copy_from_slice(&leaf(22)[x * 64..][..64]);
+        let [centre, xm, xp, ym, yp, zm, zp] = leaves(values, around, [13, 4, 22, 10, 16, 12, 14]);
+        for x in 0..REACH {
+            self.slabs[2 - x][24..88].copy_from_slice(slab(xm, 7 - x));
+            self.slabs[11 + x][24..88].copy_from_slice(slab(xp, x));
         }
+        let rim = 8 * REACH;
         for x in 0..8 {
+            let (own, below, above) = (slab(centre, x), slab(zm, x), slab(zp, x));
             let rows = &mut self.slabs[3 + x];
-            rows[..24].copy_from_slice(&leaf(10)[x * 64 + 40..][..24]);
-            rows[24..88].copy_from_slice(&centre[x * 64..][..64]);
-            rows[88..].copy_from_slice(&leaf(16)[x * 64..][..24]);
-            let (own, below, above) = (slab(leaf(13), x), slab(leaf(12), x), slab(leaf(14), x));
-            let [m3, m2, m1, p1, p2, p3] = &mut self.shifted;
-            shift_up::<64, 3>(&mut m3[x], own, below);
-            shift_up::<64, 2>(&mut m2[x], own, below);
+            rows[24 - rim..24].copy_from_slice(&slab(ym, x)[64 - rim..]);
+            rows[24..88].copy_from_slice(own);
+            rows[88..88 + rim].copy_from_slice(&slab(yp, x)[..rim]);
+            let [m1, p1, m2, p2, m3, p3] = &mut self.shifted;
             shift_up::<64, 1>(&mut m1[x], own, below);
             shift_down::<64, 1>(&mut p1[x], own, above);
-            shift_down::<64, 2>(&mut p2[x], own, above);
-            shift_down::<64, 3>(&mut p3[x], own, above);
+            if REACH > 1 {
+                shift_up::<64, 2>(&mut m2[x], own, below);
+                shift_down::<64, 2>(&mut p2[x], own, above);
+                shift_up::<64, 3>(&mut m3[x], own, below);
+                shift_down::<64, 3>(&mut p3[x], own, above);
+            }
         }
     }
 
@@ -122,27 +163,67 @@ impl StarHalo {
         Lanes::from_slice(simd, &self.slabs[x + 3][(y + 3) * 8..][..16])
     }
 
+    /// The rows `by` steps along `axis`.
+    #[inline(always)]
+    fn shifted_rows<S: Simd>(&self, simd: S, x: usize, y: usize, axis: usize, by: isize) -> Lanes<S> {
+        let steps = by.unsigned_abs();
+        let rows = match axis {
+            0 => &self.slabs[(x + 3).wrapping_add_signed(by)][(y + 3) * 8..],
+            1 => &self.slabs[x + 3][(y + 3).wrapping_add_signed(by) * 8..],
+            _ => &self.shifted[2 * steps - usize::from(by < 0) - 1][x][y * 8..],
+        };
+        Lanes::from_slice(simd, &rows[..16])
+    }
+}
+
+impl StarHalo<3> {
     /// The rows at steps −3, −2, −1, 1, 2, 3 along `axis` (0 = x, 1 = y, 2 = z).
     #[inline(always)]
     pub fn along<S: Simd>(&self, simd: S, x: usize, y: usize, axis: usize) -> [Lanes<S>; 6] {
         // Written out: a closure would not be inlined into the code of the chosen instruction set.
         macro_rules! load {
-            ($($k:literal $step:literal),*) => {
-                match axis {
-                    0 => [$(Lanes::from_slice(simd, &self.slabs[x + $step][(y + 3) * 8..][..16])),*],
-                    1 => [$(Lanes::from_slice(simd, &self.slabs[x + 3][(y + $step) * 8..][..16])),*],
-                    _ => [$(Lanes::from_slice(simd, &self.shifted[$k][x][y * 8..][..16])),*],
-                }
-            };
+            ($($step:literal),*) => { [$(self.shifted_rows(simd, x, y, axis, $step)),*] };
         }
-        load!(0 0, 1 1, 2 2, 3 4, 4 5, 5 6)
+        load!(-3, -2, -1, 1, 2, 3)
     }
 }
 
-impl Default for StarHalo {
+impl<const REACH: usize> LeafHalo for StarHalo<REACH> {
+    #[inline(always)]
+    fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
+        Self::gather(self, values, around);
+    }
+
+    #[inline(always)]
+    fn centre<S: Simd>(&self, simd: S, x: usize, y: usize) -> Lanes<S> {
+        Self::centre(self, simd, x, y)
+    }
+
+    #[inline(always)]
+    fn beside<S: Simd>(&self, simd: S, x: usize, y: usize, axis: usize) -> [Lanes<S>; 2] {
+        [self.shifted_rows(simd, x, y, axis, -1), self.shifted_rows(simd, x, y, axis, 1)]
+    }
+}
+
+impl<const REACH: usize> Default for StarHalo<REACH> {
     fn default() -> Self {
         Self::new()
     }
+}
+
+/// The values of some of the leaves around and including one.
+#[inline(always)]
+fn leaves<'a, const N: usize>(
+    values: &'a Paged<LeafValues>,
+    around: &Neighbours,
+    which: [usize; N],
+) -> [&'a [f32; LEAF_VOXELS]; N] {
+    // Not by `map`, which would not be inlined.
+    let mut leaves = [&values.get(around[which[0]]).0; N];
+    for (leaf, q) in leaves.iter_mut().zip(which) {
+        *leaf = &values.get(around[q]).0;
+    }
+    leaves
 }
 
 /// The 64 values of slab x of a leaf.
@@ -214,8 +295,9 @@ mod tests {
             let grid = self.0;
             let centre = grid.find(IVec3::ZERO);
             let around = &grid.neighbours()[centre.index()];
-            let (mut halo, mut star) = (Halo::new(), StarHalo::new());
+            let (mut halo, mut star, mut face) = (Halo::new(), StarHalo::new(), FaceHalo::new());
             halo.gather(grid.value_pages(), around);
+            face.gather(grid.value_pages(), around);
             star.gather(grid.value_pages(), around);
             for x in 0..8usize {
                 for y in (0..8usize).step_by(2) {
@@ -230,6 +312,9 @@ mod tests {
                         }
                     }
                     for axis in 0..3 {
+                        let [m1, p1] = face.beside(simd, x, y, axis);
+                        let [_, _, before, after, _, _] = star.along(simd, x, y, axis);
+                        assert!((0..16).all(|lane| m1[lane] == before[lane] && p1[lane] == after[lane]));
                         for (rows, step) in star.along(simd, x, y, axis).into_iter().zip([-3, -2, -1, 1, 2, 3]) {
                             for lane in 0..16 {
                                 let mut ijk = at(lane);
@@ -238,7 +323,7 @@ mod tests {
                             }
                         }
                     }
-                    assert_eq!(star.centre(simd, x, y)[9], value(at(9)));
+                    assert_eq!((star.centre(simd, x, y)[9], face.centre(simd, x, y)[9]), (value(at(9)), value(at(9))));
                 }
             }
         }

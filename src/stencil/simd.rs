@@ -6,7 +6,8 @@
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
-use fearless_simd::{Level, Simd, f32x16};
+use fearless_simd::{Level, f32x16};
+pub use fearless_simd::{Select, Simd, SimdBase};
 
 /// Sixteen values: two rows of a leaf, z fastest.
 pub type Lanes<S> = f32x16<S>;

@@ -1,17 +1,19 @@
 //! Upwind |∇φ|² of a row: Godunov's choice among one-sided differences, first order or HJ-WENO5.
 //!
-//! For φ_t + S(|∇φ| − 1) = 0 with S of φ's sign, information flows away from the surface:
+//! For φ_t + F|∇φ| = … information comes from where φ is smaller if F > 0, and from where it is larger if F < 0:
 //!
-//! > φ > 0:  |Dφ|² = Σ max( max(D⁻, 0)², min(D⁺, 0)² )
-//! > φ ≤ 0:  |Dφ|² = Σ max( min(D⁻, 0)², max(D⁺, 0)² )
+//! > F > 0:  |Dφ|² = Σ max( max(D⁻, 0)², min(D⁺, 0)² )
+//! > F ≤ 0:  |Dφ|² = Σ max( min(D⁻, 0)², max(D⁺, 0)² )
+//!
+//! Renormalisation, φ_τ + S(|∇φ| − 1) = 0 with S of φ's sign, takes φ itself for F: information flows away from the surface.
 //!
 //! HJ-WENO5 weighs three third-order one-sided differences by their smoothness (Jiang & Peng 2000; Shu's ICASE report
 //! 97-65); fifth order where φ is smooth, and never worse than third order beside a kink.
 
-use fearless_simd::{Select, Simd, SimdBase};
+use fearless_simd::{Select, Simd, SimdBase, SimdMask};
 
 use super::simd::Lanes;
-use super::{Halo, StarHalo};
+use super::{LeafHalo, StarHalo};
 
 /// The one-sided differences in use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -23,53 +25,75 @@ pub enum UpwindScheme {
     HjWeno5,
 }
 
-/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by first-order differences.
+/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by first-order differences, upwind for a speed of `direction`'s sign.
 #[inline(always)]
-pub fn godunov_first<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize) -> Lanes<S> {
-    let centre = halo.rows(simd, x, y, [0; 3]);
+pub fn godunov_first<S: Simd>(simd: S, halo: &impl LeafHalo, x: usize, y: usize, direction: Lanes<S>) -> Lanes<S> {
+    let centre = halo.centre(simd, x, y);
+    let sign = mirror(simd, direction);
     let mut sum = Lanes::splat(simd, 0.0);
     for axis in 0..3 {
-        let mut step = [0; 3];
-        step[axis] = 1;
-        let after = halo.rows(simd, x, y, step);
-        let before = halo.rows(simd, x, y, step.map(isize::wrapping_neg));
-        sum += godunov(simd, centre, centre - before, after - centre);
+        let [before, after] = halo.beside(simd, x, y, axis);
+        sum += godunov(simd, (centre - before) * sign, (after - centre) * sign);
     }
     sum
 }
 
-/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by HJ-WENO5 differences.
+/// Godunov's |Dφ|² (unscaled) of rows (x, y) and (x, y + 1) by HJ-WENO5 differences, upwind for a speed of `direction`'s sign.
 #[inline(always)]
 pub fn godunov_weno5<S: Simd>(
     simd: S,
     halo: &StarHalo,
     x: usize,
     y: usize,
+    direction: Lanes<S>,
     voxel_size: f32,
     epsilon: WenoEpsilon,
 ) -> Lanes<S> {
+    let (centre, sign) = (halo.centre(simd, x, y), mirror(simd, direction));
     let scale = 1.0 / (voxel_size * voxel_size);
-    let centre = halo.centre(simd, x, y);
-    let mut sum = Lanes::splat(simd, 0.0);
-    for axis in 0..3 {
-        let [m3, m2, m1, p1, p2, p3] = halo.along(simd, x, y, axis);
-        let (v1, v2, v3) = (m2 - m3, m1 - m2, centre - m1);
-        let (v4, v5, v6) = (p1 - centre, p2 - p1, p3 - p2);
-        let before = weno5(simd, [v1, v2, v3, v4, v5], scale, epsilon);
-        let after = weno5(simd, [v6, v5, v4, v3, v2], scale, epsilon);
-        sum += godunov(simd, centre, before, after);
-    }
-    sum
+    godunov_weno5_axis(simd, centre, halo.along(simd, x, y, 0), sign, scale, epsilon)
+        + godunov_weno5_axis(simd, centre, halo.along(simd, x, y, 1), sign, scale, epsilon)
+        + godunov_weno5_axis(simd, centre, halo.along(simd, x, y, 2), sign, scale, epsilon)
 }
 
-/// One axis of Godunov's |Dφ|², for a field that grows away from its zero set.
+/// One axis of Godunov's |Dφ|² by HJ-WENO5 differences, from the values at −3, −2, −1, 1, 2, 3.
 #[inline(always)]
-fn godunov<S: Simd>(simd: S, phi: Lanes<S>, before: Lanes<S>, after: Lanes<S>) -> Lanes<S> {
+fn godunov_weno5_axis<S: Simd>(
+    simd: S,
+    centre: Lanes<S>,
+    [m3, m2, m1, p1, p2, p3]: [Lanes<S>; 6],
+    sign: Lanes<S>,
+    scale: f32,
+    epsilon: WenoEpsilon,
+) -> Lanes<S> {
     let zero = Lanes::splat(simd, 0.0);
-    // Inside, the mirrored field −φ obeys the outside rule.
-    let outside = phi.simd_gt(zero);
-    let a = outside.select(before, -before).max(zero);
-    let b = outside.select(after, -after).min(zero);
+    let (v1, v2, v3) = ((m2 - m3) * sign, (m1 - m2) * sign, (centre - m1) * sign);
+    let (v4, v5, v6) = ((p1 - centre) * sign, (p2 - p1) * sign, (p3 - p2) * sign);
+    // A side counts only where its difference has the right sign. WENO5's is a mean of three candidates: where all of them have
+    // the wrong one, so has it, and is not needed. Of a distance that is one side nearly everywhere.
+    let (behind, ahead) = ([v1, v2, v3, v4, v5], [v6, v5, v4, v3, v2]);
+    let ([a1, a2, a3], [b1, b2, b3]) = (candidates(behind), candidates(ahead));
+    let (mut before, mut after) = (zero, zero);
+    if a1.max(a2).max(a3).simd_gt(zero).any_true() {
+        before = weno5(simd, behind, scale, epsilon);
+    }
+    if b1.min(b2).min(b3).simd_lt(zero).any_true() {
+        after = weno5(simd, ahead, scale, epsilon);
+    }
+    godunov(simd, before, after)
+}
+
+/// 1 where the direction is positive, else −1: for F ≤ 0 the mirrored field −φ obeys the rule for F > 0.
+#[inline(always)]
+fn mirror<S: Simd>(simd: S, direction: Lanes<S>) -> Lanes<S> {
+    direction.simd_gt(Lanes::splat(simd, 0.0)).select(Lanes::splat(simd, 1.0), Lanes::splat(simd, -1.0))
+}
+
+/// One axis of Godunov's |Dφ|² for F > 0.
+#[inline(always)]
+fn godunov<S: Simd>(simd: S, before: Lanes<S>, after: Lanes<S>) -> Lanes<S> {
+    let zero = Lanes::splat(simd, 0.0);
+    let (a, b) = (before.max(zero), after.min(zero));
     (a * a).max(b * b)
 }
 
@@ -105,8 +129,14 @@ pub fn weno5<S: Simd>(simd: S, [v1, v2, v3, v4, v5]: [Lanes<S>; 5], scale: f32, 
     // The weights γ/s² times (s₁s₂s₃)²: products instead of three quotients.
     let (p1, p2, p3) = (s2 * s3, s1 * s3, s1 * s2);
     let (a1, a2, a3) = (p1 * p1 * 0.1, p2 * p2 * 0.6, p3 * p3 * 0.3);
-    (a1 * (v1 * 2.0 - v2 * 7.0 + v3 * 11.0) + a2 * (v3 * 5.0 - v2 + v4 * 2.0) + a3 * (v3 * 2.0 + v4 * 5.0 - v5))
-        / ((a1 + a2 + a3) * 6.0)
+    let [d1, d2, d3] = candidates([v1, v2, v3, v4, v5]);
+    (a1 * d1 + a2 * d2 + a3 * d3) / ((a1 + a2 + a3) * 6.0)
+}
+
+/// The third-order differences that HJ-WENO5 weighs, six times each.
+#[inline(always)]
+fn candidates<S: Simd>([v1, v2, v3, v4, v5]: [Lanes<S>; 5]) -> [Lanes<S>; 3] {
+    [v1 * 2.0 - v2 * 7.0 + v3 * 11.0, v3 * 5.0 - v2 + v4 * 2.0, v3 * 2.0 + v4 * 5.0 - v5]
 }
 
 /// Smoothness of a third-order stencil in squared voxel sizes: large beside a kink.
@@ -127,7 +157,8 @@ mod tests {
             fn run<S: Simd>(self, simd: S) {
                 let splat = |v: f32| Lanes::splat(simd, v);
                 self.0(&mut |v, e| weno5(simd, v.map(splat), 1.0, e)[0], &mut |[p, b, a]| {
-                    godunov(simd, splat(p), splat(b), splat(a))[0]
+                    let sign = mirror(simd, splat(p));
+                    godunov(simd, splat(b) * sign, splat(a) * sign)[0]
                 });
             }
         }

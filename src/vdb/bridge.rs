@@ -103,6 +103,7 @@ pub(super) mod ffi {
         fn set_creator(self: Pin<&mut FloatGrid>, creator: &str) -> Result<()>;
         fn set_half(self: Pin<&mut FloatGrid>, half: bool) -> Result<()>;
         fn new_level_set(background: f64) -> Result<UniquePtr<FloatGrid>>;
+        fn new_float_grid(background: f64) -> Result<UniquePtr<FloatGrid>>;
         fn float_grid_leaves(grid: &FloatGrid) -> Result<UniquePtr<Leaves>>;
 
         type Output;
@@ -127,6 +128,11 @@ pub(super) mod ffi {
         fn quads(self: &RawMesh, out: &mut [u32]) -> Result<()>;
         fn copy_grid(grid: &FloatGrid) -> Result<UniquePtr<FloatGrid>>;
         fn filter_mean_curvature(grid: Pin<&mut FloatGrid>, steps: usize, tracker: &TrackerOptions) -> Result<()>;
+        fn filter_mean_curvature_masked(
+            grid: Pin<&mut FloatGrid>,
+            mask: &FloatGrid,
+            tracker: &TrackerOptions,
+        ) -> Result<()>;
         fn filter_laplacian(grid: Pin<&mut FloatGrid>, steps: usize, tracker: &TrackerOptions) -> Result<()>;
         fn filter_gaussian(grid: Pin<&mut FloatGrid>, width: i32, tracker: &TrackerOptions) -> Result<()>;
         fn filter_mean(grid: Pin<&mut FloatGrid>, width: i32, tracker: &TrackerOptions) -> Result<()>;
@@ -147,6 +153,16 @@ pub(super) mod ffi {
         fn volume_to_mesh(grid: &FloatGrid, iso: f64, adaptivity: f64) -> Result<UniquePtr<RawMesh>>;
         fn level_set_area(grid: &FloatGrid) -> Result<f64>;
         fn level_set_volume(grid: &FloatGrid) -> Result<f64>;
+        fn morph(
+            grid: Pin<&mut FloatGrid>,
+            target: &FloatGrid,
+            time: f32,
+            weno5: bool,
+            runge_kutta: u32,
+            tracker: &TrackerOptions,
+        ) -> Result<usize>;
+        fn sdf_to_sdf(grid: &FloatGrid, iterations: i32) -> Result<UniquePtr<FloatGrid>>;
+        fn dilate_sdf(grid: &FloatGrid, voxels: i32, iterations: i32) -> Result<UniquePtr<FloatGrid>>;
     }
 }
 

@@ -5,7 +5,7 @@
 //! OpenVDB's own operators for comparison.
 //!
 //! The C++ side is in `cpp/` and small on purpose: `archive.cc` (files), `grid.cc` (leaves and tiles), `reference.cc`
-//! (OpenVDB's tools). Every C++ exception becomes an error here; nothing that OpenVDB logs reaches standard output.
+//! and `reference_morph.cc` (OpenVDB's tools). Every C++ exception becomes an error here; nothing that OpenVDB logs reaches standard output.
 //!
 //! A truncated or damaged file is an error wherever it shows: the bytes end early, a grid does not begin or end where the
 //! file says, or bytes are left over. OpenVDB itself loads files cut short without a word when they are not compressed by blosc.
@@ -23,4 +23,4 @@ mod write;
 pub use band::{Band, BandFacts, Range, diagnose_band};
 pub use listing::{Compression, FileListing, GridListing, MetaItem, Precision};
 pub use read::{ReadLevelSet, VdbFile, library_version, list, open, set_threads};
-pub use write::{GridToWrite, WriteOptions, WriteReport, write};
+pub use write::{FieldToWrite, GridToWrite, WriteOptions, WriteReport, write, write_with_fields};

@@ -170,6 +170,36 @@ impl ReferenceGrid {
         .map_err(failed)
     }
 
+    /// OpenVDB's `LevelSetMorphing` towards `target` for a time, spatial scheme and Runge–Kutta order first; returns its steps.
+    pub fn morph(
+        &mut self,
+        target: &Self,
+        time: f32,
+        scheme: ReferenceScheme,
+        runge_kutta: u32,
+        tracker: &Tracker,
+    ) -> Result<usize> {
+        let weno5 = scheme == ReferenceScheme::HjWeno5;
+        ffi::morph(self.grid.pin_mut(), &target.grid, time, weno5, runge_kutta, &tracker.raw()).map_err(failed)
+    }
+
+    /// OpenVDB's sdfToSdf: distances again by fast sweeping, in the same voxels.
+    pub fn sweep(&self, iterations: i32) -> Result<Self> {
+        let grid = ffi::sdf_to_sdf(&self.grid, iterations).map_err(failed)?;
+        Ok(Self { grid, transform: self.transform })
+    }
+
+    /// OpenVDB's dilateSdf: distances by fast sweeping in so many more layers of face neighbours.
+    pub fn sweep_outwards(&self, voxels: i32, iterations: i32) -> Result<Self> {
+        let grid = ffi::dilate_sdf(&self.grid, voxels, iterations).map_err(failed)?;
+        Ok(Self { grid, transform: self.transform })
+    }
+
+    /// One step of mean curvature flow, weighted by the values of `mask` (0 to 1, as active voxels of a grid).
+    pub fn mean_curvature_masked(&mut self, mask: &Self, tracker: &Tracker) -> Result<()> {
+        ffi::filter_mean_curvature_masked(self.grid.pin_mut(), &mask.grid, &tracker.raw()).map_err(failed)
+    }
+
     /// A constructive operation into a new grid. Both must have the same transform.
     pub fn csg(&self, other: &Self, operation: Csg) -> Result<Self> {
         let grid = match operation {

@@ -12,10 +12,13 @@ use super::read::{PIPE, VdbFile};
 use crate::atomic::{Unfinished, final_target};
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, Transform};
-use crate::levelset::LevelSet;
+use crate::levelset::{Field, LevelSet};
 
 /// The smallest edge of a voxel that OpenVDB's maps take: they refuse determinants below 3e-15.
 const SMALLEST_VOXEL: f64 = 1.45e-5;
+
+/// What made a grid, in its metadata.
+const CREATOR: &str = concat!("vdb-edit ", env!("CARGO_PKG_VERSION"));
 
 /// How a file is written. The default keeps what the input had, else float and blosc.
 #[derive(Clone, Debug, Default)]
@@ -39,6 +42,15 @@ pub struct GridToWrite<'a> {
     pub replaces: Option<usize>,
 }
 
+/// A field on its way to a file, as a float grid of no class.
+#[derive(Clone, Copy)]
+pub struct FieldToWrite<'a> {
+    /// The field.
+    pub field: &'a Field,
+    /// Its name.
+    pub name: &'a str,
+}
+
 /// What was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WriteReport {
@@ -60,11 +72,24 @@ pub fn write(
     input: Option<&VdbFile>,
     options: &WriteOptions,
 ) -> Result<WriteReport> {
+    write_with_fields(path, grids, &[], input, options)
+}
+
+/// As [`write()`], with fields after all other grids.
+pub fn write_with_fields(
+    path: impl AsRef<Path>,
+    grids: &[GridToWrite<'_>],
+    fields: &[FieldToWrite<'_>],
+    input: Option<&VdbFile>,
+    options: &WriteOptions,
+) -> Result<WriteReport> {
     let path = path.as_ref();
     let output = Target { path };
     let compression = options.compression.or_else(|| Compression::of_all(&input?.listing().grids));
     let compression = compression.unwrap_or(Compression::Blosc);
-    if let Some(small) = grids.iter().map(|g| g.level_set.voxel_size()).find(|size| *size < SMALLEST_VOXEL) {
+    let sizes = grids.iter().map(|g| g.level_set.voxel_size());
+    let sizes = sizes.chain(fields.iter().map(|f| f.field.transform().voxel_size()));
+    if let Some(small) = sizes.into_iter().find(|size| *size < SMALLEST_VOXEL) {
         return Err(output.error(format!(
             "OpenVDB stores no voxels smaller than {SMALLEST_VOXEL} world units, these are {small:e}: scale the model up, as by `transform --scale 1000`"
         )));
@@ -74,7 +99,12 @@ pub fn write(
             file.check_present(index)?;
         }
     }
-    let (mut content, count) = collect(grids, input, options).map_err(|e| output.error(e.what()))?;
+    let (mut content, mut count) = collect(grids, input, options).map_err(|e| output.error(e.what()))?;
+    for field in fields {
+        let made = to_openvdb_field(field, options).and_then(|grid| content.pin_mut().add_grid(grid));
+        made.map_err(|e| output.error(e.what()))?;
+        count += 1;
+    }
     let bytes = output.write(content.pin_mut(), compression.flags())?;
     let mut warnings: Vec<_> =
         ffi::take_log().map_err(|e| output.error(e.what()))?.lines().map(str::to_string).collect();
@@ -127,7 +157,7 @@ fn to_openvdb_grid(
         made.pin_mut().carry(&file.archive, index, same)?;
         precision = precision.or(Some(listing.precision));
     } else {
-        made.pin_mut().set_creator(concat!("vdb-edit ", env!("CARGO_PKG_VERSION")))?;
+        made.pin_mut().set_creator(CREATOR)?;
     }
     if let Some(name) = grid.name {
         made.pin_mut().set_name(name)?;
@@ -136,11 +166,32 @@ fn to_openvdb_grid(
     Ok(made)
 }
 
+fn to_openvdb_field(
+    to_write: &FieldToWrite<'_>,
+    options: &WriteOptions,
+) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
+    let FieldToWrite { field, name } = to_write;
+    let mut made = ffi::new_float_grid(0.0)?;
+    fill(made.pin_mut(), field.grid())?;
+    made.pin_mut().set_affine(&matrix(field.transform()))?;
+    made.pin_mut().set_creator(CREATOR)?;
+    made.pin_mut().set_name(name)?;
+    made.pin_mut().set_half(options.precision == Some(Precision::Half))?;
+    Ok(made)
+}
+
 /// A copy of a level set in OpenVDB's own tree: all leaves, and the inside as tiles.
 pub(super) fn to_openvdb(level_set: &LevelSet) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
     let grid = level_set.grid();
     let mut made = ffi::new_level_set(f64::from(grid.background()))?;
     fill(made.pin_mut(), grid)?;
+    let value = -grid.background();
+    let tiles: Vec<ffi::Tile> = grid
+        .inside_tiles()
+        .into_iter()
+        .map(|(o, edge)| ffi::Tile { x: o.x, y: o.y, z: o.z, size: edge.unsigned_abs(), value, active: false })
+        .collect();
+    made.pin_mut().add_tiles(&tiles)?;
     made.pin_mut().set_affine(&matrix(level_set.transform()))?;
     Ok(made)
 }
@@ -160,14 +211,7 @@ fn fill(mut made: std::pin::Pin<&mut ffi::FloatGrid>, grid: &Grid) -> Result<(),
     ids.par_iter().with_min_len(16).enumerate().try_for_each(|(index, &id)| {
         // SAFETY: every task fills another leaf.
         unsafe { made_ref.fill(index, &grid.values(id).0, &grid.mask(id).0) }
-    })?;
-    let value = -grid.background();
-    let tiles: Vec<ffi::Tile> = grid
-        .inside_tiles()
-        .into_iter()
-        .map(|(o, edge)| ffi::Tile { x: o.x, y: o.y, z: o.z, size: edge.unsigned_abs(), value, active: false })
-        .collect();
-    made.add_tiles(&tiles)
+    })
 }
 
 /// Where a file goes.

@@ -1,0 +1,386 @@
+//! Exact signed distances to the surface of a field, in the band around the surface at an offset.
+//!
+//! Space is gone through in tiles of 32³ voxels, each one task. A tile collects the triangles near it in clusters of
+//! sixteen and is halved down to blocks of 4³ voxels. Each block gets the clusters that can be nearest to any of its voxels:
+//! if the centre of a block of radius r has the distance D, a voxel v of it has at most D + r, so a cluster nearest to v is at
+//! most D + 2r from the centre, by its box. In the same way D − r ≤ |φ| ≤ D + r tells the blocks without any voxel of the band, which are left.
+//! In the last blocks each voxel looks at the clusters whose box is nearer than the nearest triangle found so far. So every
+//! distance is that of the nearest triangle, whatever the field is; no property of φ but its sign is used.
+//!
+//! No array of all triangles is made: those at the border of tiles are made once for each tile that they are near.
+
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use glam::IVec3;
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use super::cluster::{Candidates, Clusters, Nearby, Query, SLACK};
+use crate::error::Result;
+use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues};
+use crate::levelset::BYTES_A_LEAF;
+use crate::levelset::isosurface::IsoSurface;
+use crate::run::RunOptions;
+use crate::stencil::simd::dispatch;
+
+/// Voxels along the edge of a tile: its clusters fit the second-level cache, and those of its neighbours that it needs as well are
+/// as many as half its own.
+const TILE: i32 = 32;
+/// Voxels along the edge of the blocks whose voxels are computed one by one.
+const BLOCK: i32 = 4;
+
+/// Where distances are wanted, in voxels: where the distance from the surface, less `offset`, is within the half width.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Band {
+    /// Distance of the new surface from the field's, positive outwards.
+    pub offset: f64,
+    /// Half width of the band around it.
+    pub half_width: f64,
+    /// World units a voxel.
+    pub voxel_size: f64,
+    /// |φ| beyond the band, in world units.
+    pub background: f32,
+}
+
+impl Band {
+    /// Unsigned distances from the surface that can occur in the band.
+    fn reach(&self) -> f32 {
+        (self.offset.abs() + self.half_width) as f32
+    }
+
+    /// Where a block lies whose distances are between `lo` and `hi`.
+    fn side(&self, lo: f32, hi: f32) -> Side {
+        let slack = f64::from(SLACK);
+        if f64::from(lo) > self.offset + self.half_width + slack {
+            Side::Outside
+        } else if f64::from(hi) < self.offset - self.half_width - slack {
+            Side::Inside
+        } else {
+            Side::Near
+        }
+    }
+}
+
+/// Where a block lies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Side {
+    Inside,
+    Outside,
+    /// Some of it may be in the band.
+    Near,
+}
+
+/// A leaf with its first voxel.
+pub(super) type Leaf = (IVec3, LeafValues, LeafMask);
+
+/// The leaves of a band, those of each tile together, tiles in the order of their origins.
+pub(super) fn leaves_of_band(
+    operation: &str,
+    surface: &IsoSurface,
+    field: &Grid,
+    iso: f32,
+    band: Band,
+    run: &RunOptions,
+) -> Result<Vec<Vec<Leaf>>> {
+    let search = Search { sources: Sources::new(surface, field), surface, field, iso, band };
+    let tiles = search.sources.tiles_within(band.reach());
+    let task = run.task("distances", tiles.len() as u64);
+    let made = AtomicU64::new(0);
+    tiles
+        .par_iter()
+        .map_init(Scratch::default, |scratch, &tile| {
+            run.check(operation)?;
+            let mut leaves = Vec::new();
+            let triangles = search.collect(tile, scratch);
+            // Neither the triangles of a tile nor all leaves so far may need more than there is.
+            run.reserve(operation, triangles * Clusters::BYTES_A_TRIANGLE, "take a smaller distance")?;
+            search.tile(tile, scratch, &mut leaves);
+            let made = made.fetch_add(leaves.len() as u64, Ordering::Relaxed) + leaves.len() as u64;
+            run.reserve(operation, made * BYTES_A_LEAF, "take a narrower band, a smaller distance or larger voxels")?;
+            task.advance(1);
+            Ok(leaves)
+        })
+        .collect()
+}
+
+/// The leaves that the surface crosses, by tile.
+struct Sources {
+    /// Origin, and place among the surface's leaves.
+    leaves: Vec<(IVec3, usize)>,
+    tiles: FxHashMap<IVec3, Range<usize>>,
+}
+
+impl Sources {
+    fn new(surface: &IsoSurface, field: &Grid) -> Self {
+        let mut leaves: Vec<(IVec3, usize)> =
+            surface.leaves().iter().enumerate().map(|(place, leaf)| (field.origin(leaf.id), place)).collect();
+        leaves.sort_unstable_by_key(|(origin, _)| (tile_of(*origin).to_array(), origin.to_array()));
+        let mut tiles = FxHashMap::default();
+        let mut first = 0;
+        for run in leaves.chunk_by(|a, b| tile_of(a.0) == tile_of(b.0)) {
+            tiles.insert(tile_of(run[0].0), first..first + run.len());
+            first += run.len();
+        }
+        Self { leaves, tiles }
+    }
+
+    /// How many tiles away a tile can be whose triangles are within reach.
+    fn steps(reach: f32) -> i32 {
+        1 + reach as i32 / TILE
+    }
+
+    /// All tiles with leaves within reach, in the order of their origins.
+    fn tiles_within(&self, reach: f32) -> Vec<IVec3> {
+        let mut tiles: Vec<[i32; 3]> = Vec::new();
+        for &tile in self.tiles.keys() {
+            for_each_around(tile, Self::steps(reach), |other| tiles.push(other.to_array()));
+        }
+        tiles.sort_unstable();
+        tiles.dedup();
+        tiles.into_iter().map(IVec3::from_array).collect()
+    }
+}
+
+fn tile_of(ijk: IVec3) -> IVec3 {
+    ijk.div_euclid(IVec3::splat(TILE))
+}
+
+/// The first and the last voxel of a tile.
+fn tile_bounds(tile: IVec3) -> (IVec3, IVec3) {
+    (tile * TILE, tile * TILE + (TILE - 1))
+}
+
+fn for_each_around(tile: IVec3, steps: i32, mut f: impl FnMut(IVec3)) {
+    for x in -steps..=steps {
+        for y in -steps..=steps {
+            for z in -steps..=steps {
+                f(tile + IVec3::new(x, y, z));
+            }
+        }
+    }
+}
+
+/// Square of the distance between two boxes of lattice points.
+fn gap_squared(a: (IVec3, IVec3), b: (IVec3, IVec3)) -> i32 {
+    (b.0 - a.1).max(a.0 - b.1).max(IVec3::ZERO).length_squared()
+}
+
+/// Buffers that a thread uses for one tile after the other.
+#[derive(Default)]
+struct Scratch {
+    /// Places of leaves of the surface, with the squares of their distances from the tile.
+    near: Vec<(usize, i32)>,
+    /// Square of the distance up to which triangles can be nearest to a voxel of the tile.
+    farthest: i32,
+    clusters: Clusters,
+    /// The candidates of the current block at each level below the tile.
+    lists: [Candidates; 3],
+}
+
+struct Search<'a> {
+    sources: Sources,
+    surface: &'a IsoSurface<'a>,
+    field: &'a Grid,
+    iso: f32,
+    band: Band,
+}
+
+impl Search<'_> {
+    /// Finds the leaves of the surface near a tile, none if no voxel of it can be in the band; returns the number of their triangles.
+    fn collect(&self, tile: IVec3, scratch: &mut Scratch) -> u64 {
+        let Scratch { near, farthest, .. } = scratch;
+        let bounds = tile_bounds(tile);
+        let reach = self.band.reach();
+        // No voxel of the tile is farther from the surface than from the farthest point of any leaf with some of it.
+        *farthest = (reach * reach).ceil() as i32;
+        let mut nearest = i32::MAX;
+        near.clear();
+        for_each_around(tile, Sources::steps(reach), |other| {
+            let Some(range) = self.sources.tiles.get(&other) else { return };
+            for &(first, place) in &self.sources.leaves[range.clone()] {
+                let last = first + LEAF_DIM;
+                let gap = gap_squared(bounds, (first, last));
+                nearest = nearest.min(gap);
+                *farthest = (*farthest).min((last - bounds.0).max(bounds.1 - first).length_squared());
+                near.push((place, gap));
+            }
+        });
+        let side = if nearest == 0 {
+            Side::Near
+        } else {
+            let (lo, hi) = ((nearest as f32).sqrt(), (*farthest as f32).sqrt());
+            // Beyond the reach the upper bound is none.
+            let hi = if hi < reach { hi } else { f32::INFINITY };
+            if self.inside(bounds.0) { self.band.side(-hi, -lo) } else { self.band.side(lo, hi) }
+        };
+        near.retain(|(_, gap)| side == Side::Near && *gap <= *farthest);
+        near.iter().map(|&(place, _)| u64::from(self.surface.leaves()[place].triangles)).sum()
+    }
+
+    /// Adds the leaves of a tile that have voxels in the band, from the triangles of what was collected.
+    fn tile(&self, tile: IVec3, scratch: &mut Scratch, leaves: &mut Vec<Leaf>) {
+        let Scratch { near, farthest, clusters, lists } = scratch;
+        if near.is_empty() {
+            return;
+        }
+        let bounds = tile_bounds(tile);
+        clusters.clear();
+        for &(place, _) in near.iter() {
+            let leaf = &self.surface.leaves()[place];
+            let from = self.field.origin(leaf.id);
+            let wanted = |cell: IVec3| gap_squared(bounds, (from + cell, from + cell + 1)) <= *farthest;
+            self.surface.for_each_triangle(leaf, wanted, |cell, corners| {
+                clusters.push((from + cell - bounds.0).as_vec3(), corners);
+            });
+        }
+        clusters.finish();
+        let block = Block { origin: IVec3::ZERO, edge: TILE, nearest: 0 };
+        self.halves(bounds.0, block, clusters, &clusters.boxes, lists, leaves);
+    }
+
+    /// Goes down into the eight halves of a block, whose candidates are `from`.
+    fn halves(
+        &self,
+        tile: IVec3,
+        block: Block,
+        clusters: &Clusters,
+        from: &Candidates,
+        lists: &mut [Candidates],
+        leaves: &mut Vec<Leaf>,
+    ) {
+        let Some((list, lists)) = lists.split_first_mut() else { return };
+        for half in block.halves() {
+            let (side, nearest) = self.enter(tile, half, clusters, from, list);
+            let half = Block { nearest, ..half };
+            if side != Side::Near {
+                continue;
+            }
+            if half.edge == LEAF_DIM {
+                if let [last, ..] = lists {
+                    leaves.push((tile + half.origin, LeafValues::default(), LeafMask::EMPTY));
+                    if let Some((_, values, active)) = leaves.last_mut() {
+                        self.leaf(tile, half, clusters, list, last, values, active);
+                        if active.is_empty() {
+                            leaves.pop();
+                        }
+                    }
+                }
+            } else {
+                self.halves(tile, half, clusters, list, lists, leaves);
+            }
+        }
+    }
+
+    /// Where a block lies, and its nearest cluster; if it is near, `list` gets those of its candidates that can be nearest to a voxel of it.
+    fn enter(
+        &self,
+        tile: IVec3,
+        block: Block,
+        clusters: &Clusters,
+        from: &Candidates,
+        list: &mut Candidates,
+    ) -> (Side, u32) {
+        let centre = block.origin.as_vec3() + (block.edge - 1) as f32 / 2.0;
+        // Half the diagonal of its voxels, and what covers the rounding.
+        let radius = (block.edge - 1) as f32 / 2.0 * 3f32.sqrt() + SLACK;
+        let limit = self.band.reach() + radius;
+        let mut nearest = block.nearest;
+        let mut out = [[0.0]];
+        dispatch(Query {
+            candidates: from,
+            clusters,
+            first: centre,
+            limit_squared: limit * limit,
+            guess: &mut nearest,
+            out: &mut out,
+        });
+        // At the limit nothing was found, and no voxel of the block is within reach.
+        let distance = if out[0][0] < limit * limit { out[0][0].sqrt() } else { f32::INFINITY };
+        let (lo, hi) = (distance - radius, distance + radius);
+        let side = if lo <= 0.0 {
+            self.band.side(-hi, hi)
+        } else if self.inside(tile + block.origin) {
+            // No edge of the lattice crosses the surface within the block: its voxels have one sign.
+            self.band.side(-hi, -lo)
+        } else {
+            self.band.side(lo, hi)
+        };
+        if side == Side::Near {
+            dispatch(Nearby { from, to: list, centre, reach: limit.min(distance + 2.0 * radius) });
+        }
+        (side, nearest)
+    }
+
+    /// Fills the leaf at a block.
+    #[expect(clippy::too_many_arguments, reason = "buffers that are reused from leaf to leaf")]
+    fn leaf(
+        &self,
+        tile: IVec3,
+        block: Block,
+        clusters: &Clusters,
+        from: &Candidates,
+        list: &mut Candidates,
+        values: &mut LeafValues,
+        active: &mut LeafMask,
+    ) {
+        let Band { offset, voxel_size, background, .. } = self.band;
+        let reach = self.band.reach();
+        let origin = tile + block.origin;
+        let field = &self.field.values(self.field.find(origin)).0;
+        for half in block.halves() {
+            let (side, mut nearest) = self.enter(tile, half, clusters, from, list);
+            let mut squared = [[f32::INFINITY; BLOCK as usize]; (BLOCK * BLOCK) as usize];
+            if side == Side::Near {
+                dispatch(Query {
+                    candidates: list,
+                    clusters,
+                    first: half.origin.as_vec3(),
+                    limit_squared: reach * reach,
+                    guess: &mut nearest,
+                    out: &mut squared,
+                });
+            }
+            let first = half.origin - block.origin;
+            for (row, squared) in squared.iter().enumerate() {
+                let start = (first.x * 64 + first.y * 8 + first.z) as usize + row / 4 * 64 + row % 4 * 8;
+                for (at, squared) in (start..LEAF_VOXELS).zip(squared) {
+                    let distance = squared.sqrt();
+                    let unsigned = f64::from(distance);
+                    let signed = if field[at] < self.iso { -unsigned - offset } else { unsigned - offset };
+                    let phi = (signed * voxel_size) as f32;
+                    // What lies beyond the reach is farther than the band.
+                    let known = distance < reach;
+                    let (near, phi) = match side {
+                        Side::Near => (known && phi.abs() < background, phi),
+                        Side::Inside => (false, -background),
+                        Side::Outside => (false, background),
+                    };
+                    values.0[at] = if near { phi } else { background.copysign(phi) };
+                    active.set(at, near);
+                }
+            }
+        }
+    }
+
+    fn inside(&self, ijk: IVec3) -> bool {
+        self.field.voxel(ijk).0 < self.iso
+    }
+}
+
+/// A cube of voxels of a tile.
+#[derive(Clone, Copy)]
+struct Block {
+    /// Relative to the tile.
+    origin: IVec3,
+    edge: i32,
+    /// A cluster near it.
+    nearest: u32,
+}
+
+impl Block {
+    fn halves(self) -> impl Iterator<Item = Self> {
+        let edge = self.edge / 2;
+        (0..8).map(move |c| Self { origin: self.origin + IVec3::new(c >> 2, c >> 1 & 1, c & 1) * edge, edge, ..self })
+    }
+}
