@@ -6,7 +6,7 @@ use vdb_edit::LevelSet;
 use vdb_edit::grid::{Transform, offset_to_local};
 use vdb_edit::ops::csg::{CsgOperation, csg};
 use vdb_edit::ops::{Arity, Entry, REGISTRY, find};
-use vdb_edit::region::parse_regions;
+use vdb_edit::region::RegionPlan;
 use vdb_edit::run::RunOptions;
 
 const DX: f64 = 0.1;
@@ -249,13 +249,14 @@ fn a_cancelled_run_says_so() {
 /// Every voxel that was active and has weight 0 keeps its bits.
 #[test]
 fn nothing_happens_outside_the_region() {
-    let region = parse_regions(&[REGION.into()]).unwrap().unwrap();
+    let plan = RegionPlan::parse(&[REGION.into()]).unwrap().unwrap();
     let mut limited = 0;
     for entry in REGISTRY.iter().filter(|entry| entry.parameters().iter().any(|p| p.name == "region")) {
         limited += 1;
         for (name, subject) in subjects() {
             let mut values = needed(entry);
             values.insert("region".into(), json!(REGION));
+            let region = plan.on(&subject, &RunOptions::default()).unwrap();
             let result = run(entry, values, &subject);
             assert_eq!(result.check(), [], "{} of the {name}", entry.name);
             let (mut kept, mut changed) = (0, 0);

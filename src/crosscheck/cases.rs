@@ -171,7 +171,7 @@ fn masked_mean_curvature<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let radius = distances[(distances.len() as f64 * MASKED) as usize];
     let spec = format!("sphere center={},{},{} radius={radius}", centre.x, centre.y, centre.z);
     let evolution = EvolutionOptions { iterations: Some(1), region: RegionSpecs(vec![spec]), ..first_order() };
-    let region = evolution.region.parse()?;
+    let region = evolution.region.on(input.level_set, input.run)?;
     let mut weights = input.level_set.clone();
     weights.grid_mut().update_all(|id, values, _| {
         let origin = grid.origin(id);

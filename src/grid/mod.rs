@@ -15,6 +15,7 @@ mod page_pool;
 mod paged;
 mod topology;
 mod transform;
+mod volume;
 
 use std::sync::Arc;
 
@@ -29,6 +30,7 @@ pub use paged::{LeafId, PAGE_LEAVES, PageLeaves, Paged};
 use topology::Topology;
 pub use topology::{Neighbours, neighbour_index};
 pub use transform::{Transform, VOXEL_SIZES};
+pub use volume::Volume;
 
 /// Largest index coordinate of a voxel, either sign: beyond it the arithmetic of neighbours could overflow.
 pub const MAX_COORD: i32 = 1 << 30;

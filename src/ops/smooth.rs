@@ -113,7 +113,7 @@ impl Smooth {
 /// Smooths in place. The band should be at least 3 voxels wide to each side.
 pub fn smooth(level_set: &mut LevelSet, params: &Smooth, run: &RunOptions) -> Result<Report> {
     params.validate()?;
-    let region = params.evolution.region.parse()?;
+    let region = params.evolution.region.on(level_set, run)?;
     let (region, until, solver) = (region.as_deref(), params.evolution.until(), params.evolution.solver(SOLVER));
     if let Some(what) = params.filter() {
         return filter(level_set, what, params.evolution.iterations.unwrap_or(1), region, &solver, run);
@@ -257,7 +257,7 @@ mod tests {
     fn assert_only_the_region_changes(before: &LevelSet, params: &Smooth) {
         let mut after = before.clone();
         smooth(&mut after, params, &RunOptions::default()).unwrap();
-        let weight = params.evolution.region.parse().unwrap().unwrap();
+        let weight = params.evolution.region.on(before, &RunOptions::default()).unwrap().unwrap();
         let (mut frozen, mut moved) = (0, 0);
         for &id in before.grid().leaves() {
             for offset in before.grid().mask(id).iter() {

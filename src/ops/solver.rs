@@ -11,7 +11,7 @@ use crate::error::{EditError, Result};
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
 use crate::mesh::with_half_width;
 use crate::pde::{Report, SolverOptions, Until, UpwindScheme};
-use crate::region::{Region, parse_regions};
+use crate::region::{Region, RegionPlan};
 use crate::run::RunOptions;
 
 words! {
@@ -102,9 +102,14 @@ impl JsonSchema for RegionSpecs {
 }
 
 impl RegionSpecs {
-    /// The region, or `None` for everywhere.
-    pub fn parse(&self) -> Result<Option<Box<dyn Region>>> {
-        parse_regions(&self.0)
+    /// Refuses what cannot be understood.
+    pub fn validate(&self) -> Result<()> {
+        RegionPlan::parse(&self.0).map(drop)
+    }
+
+    /// The region on a level set, or `None` for everywhere. Reads the files that are named.
+    pub fn on(&self, level_set: &LevelSet, run: &RunOptions) -> Result<Option<Box<dyn Region>>> {
+        RegionPlan::parse(&self.0)?.map(|plan| plan.on(level_set, run)).transpose()
     }
 }
 
@@ -118,7 +123,7 @@ pub struct EvolutionOptions {
     /// Flow time instead of a number of steps, in world units squared (a sphere of radius R shrinks as R² − 2·time).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub time: Option<f64>,
-    /// Where to act, and how strongly; everywhere if not given. Kinds: `sphere`, `box`, `bbox`, `cylinder`, `superellipsoid`. Several multiply.
+    /// Where to act, and how strongly; everywhere if not given. Kinds: `sphere`, `box`, `bbox`, `cylinder`, `superellipsoid`, `halfspace`, `levelset`, `mesh`, `mask`, `fog`, `points`, `curve`, `component`. Several multiply.
     pub region: RegionSpecs,
     /// One-sided differences of the renormalisation after each step; weno5 if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -166,7 +171,7 @@ impl EvolutionOptions {
                 "without `scheme` and `normalizations`: it sets both",
             ));
         }
-        self.region.parse().map(drop)
+        self.region.validate()
     }
 
     /// When the flow ends.
