@@ -204,7 +204,7 @@ std::unique_ptr<FloatGrid> csg_intersection(const FloatGrid& a, const FloatGrid&
 std::unique_ptr<FloatGrid> csg_difference(const FloatGrid& a, const FloatGrid& b);
 std::unique_ptr<FloatGrid> level_set_rebuild(const FloatGrid& grid, float iso, float half_width);
 std::unique_ptr<FloatGrid> mesh_to_level_set(rust::Slice<const float> points, rust::Slice<const std::uint32_t> triangles,
-    rust::Slice<const double> matrix, float half_width);
+    rust::Slice<const double> matrix, float half_width, bool renormalize);
 std::unique_ptr<RawMesh> volume_to_mesh(const FloatGrid& grid, double iso, double adaptivity);
 double level_set_area(const FloatGrid& grid);
 double level_set_volume(const FloatGrid& grid);

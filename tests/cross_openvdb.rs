@@ -4,7 +4,9 @@
 use glam::{DVec3, IVec3};
 use vdb_edit::LevelSet;
 use vdb_edit::grid::Transform;
-use vdb_edit::mesh::{Bvh, MeshToLevelSet, Rebuild, TriangleMesh, level_set_to_mesh, mesh_to_level_set, read, rebuild};
+use vdb_edit::mesh::{
+    Bvh, MeshToLevelSet, Rebuild, TriangleMesh, WindingNumber, level_set_to_mesh, mesh_to_level_set, read, rebuild,
+};
 use vdb_edit::ops::csg::{CsgOperation, csg};
 use vdb_edit::ops::morphology::offset;
 use vdb_edit::ops::smooth::{Smooth, SmoothMethod, smooth};
@@ -321,67 +323,67 @@ fn meshes() -> Vec<(&'static str, TriangleMesh, f64)> {
     ]
 }
 
-/// Our magnitudes are exact: the tree that looks for the closest triangle of each voxel says so (1e-3 voxel is asserted, the tolerance
-/// of `crosscheck`). OpenVDB's differ from them by 7e-6 voxel on an octahedral sphere, 0.03 on a torus and up to 0.7 beside the surface
-/// of models, with some signs; why is not known (it renormalises last of all, and passes the closest triangle on from voxel to
-/// voxel). So it is asked to agree roughly: on smooth meshes 0.05 voxel beside the surface and signs alike farther from it, on models
-/// 95 % of the band, and no voxel active there that we miss but for those within 1e-4 voxel of the band's rim.
+/// A mesh converted by OpenVDB differs from ours by up to 0.7 voxel, and it is not ours that is off: the distance to the
+/// closest triangle, looked up for every voxel, and the winding number of the mesh, wherever the signs differ, say so.
+///
+/// Two things move OpenVDB's values. Last of all it renormalises: without that it agrees with us within 1e-5 near the
+/// surface. And from 1.8 voxels on it asks only the triangles that were closest for voxels nearby, so that its distances are
+/// never smaller than the true ones but up to 0.9 voxel larger.
 #[test]
-fn mesh_to_level_set_is_that_of_openvdb() {
+fn mesh_to_level_set_is_exact_where_openvdb_is_not() {
     for (name, mesh, voxel_size) in meshes() {
         let (ours, _) = mesh_to_level_set(&mesh, &MeshToLevelSet::new(voxel_size), &RunOptions::default()).unwrap();
         let points: Vec<_> = mesh.positions.iter().map(|p| p.as_vec3()).collect();
-        let theirs =
-            ReferenceGrid::from_mesh(&points, &mesh.triangles, *ours.transform(), 3.0).unwrap().to_level_set().unwrap();
         let tree = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t).map(|p| p / voxel_size)).collect());
-        let exact =
-            |ijk: IVec3| tree.closest_point(ijk.as_dvec3(), 10.0).map_or(10.0, |hit| hit.distance_squared.sqrt());
-        let (mut compared, mut apart, mut worst, mut ours_off) = (0u64, 0u64, 0f64, 0f64);
-        let (mut signs, mut only_one, mut ours_missing) = (0u64, 0u64, 0u64);
-        let (mut beside, mut largest_signed, mut gross) = (0f64, 0f64, 0u64);
-        let mut ours_at = ours.grid().accessor();
-        let mut theirs_at = theirs.grid().accessor();
-        for grid in [ours.grid(), theirs.grid()] {
-            for &id in grid.leaves() {
-                for at in grid.mask(id).iter() {
-                    let ijk = grid.origin(id) + vdb_edit::grid::offset_to_local(at);
-                    let (a, b) = (f64::from(ours_at.value(ijk)), f64::from(theirs_at.value(ijk)));
-                    let truth = exact(ijk).min(3.0);
-                    ours_off = ours_off.max((a.abs() / voxel_size - truth).abs());
-                    if ours_at.is_active(ijk) != theirs_at.is_active(ijk) {
-                        only_one += 1;
-                        ours_missing += u64::from(!ours_at.is_active(ijk) && truth < 3.0 - 1e-4);
-                    } else if (a < 0.0) == (b < 0.0) {
-                        let difference = (a - b).abs() / voxel_size;
-                        compared += 1;
-                        apart += u64::from(difference > 1e-3);
-                        gross += u64::from(difference > 0.05);
-                        worst = worst.max(difference);
-                        if truth <= 1.0 {
-                            beside = beside.max(difference);
+        let winding = WindingNumber::new(&tree);
+        let default = ReferenceGrid::from_mesh(&points, &mesh.triangles, *ours.transform(), 3.0).unwrap();
+        let plain = ReferenceGrid::from_mesh_unnormalized(&points, &mesh.triangles, *ours.transform(), 3.0).unwrap();
+        for (theirs, renormalized) in [(default, true), (plain, false)] {
+            let theirs = theirs.to_level_set().unwrap();
+            let (mut compared, mut apart, mut worst, mut beside) = (0u64, 0u64, 0f64, 0f64);
+            let (mut ours_off, mut too_small, mut signs, mut missing) = (0f64, 0f64, 0u64, 0u64);
+            let (mut ours_at, mut theirs_at) = (ours.grid().accessor(), theirs.grid().accessor());
+            for grid in [ours.grid(), theirs.grid()] {
+                for &id in grid.leaves() {
+                    for at in grid.mask(id).iter() {
+                        let ijk = grid.origin(id) + vdb_edit::grid::offset_to_local(at);
+                        let [a, b] =
+                            [ours_at.value(ijk), theirs_at.value(ijk)].map(|value| f64::from(value) / voxel_size);
+                        let hit = tree.closest_point(ijk.as_dvec3(), 10.0);
+                        let truth = hit.map_or(10.0, |hit| hit.distance_squared.sqrt()).min(3.0);
+                        ours_off = ours_off.max((a.abs() - truth).abs());
+                        if !ours_at.is_active(ijk) || !theirs_at.is_active(ijk) {
+                            missing += u64::from(!ours_at.is_active(ijk) && truth < 3.0 - 1e-4);
+                        } else if (a < 0.0) == (b < 0.0) {
+                            compared += 1;
+                            apart += u64::from((a - b).abs() > 1e-3);
+                            worst = worst.max((a - b).abs());
+                            too_small = too_small.max(truth - b.abs());
+                            if truth <= 1.5 {
+                                beside = beside.max((a - b).abs());
+                            }
+                        } else {
+                            signs += 1;
+                            // On the surface itself either sign is right.
+                            let inside = winding.at(ijk.as_dvec3()) > 0.5;
+                            assert!(truth < 1e-5 || inside == (a < 0.0), "{name}: {ijk} has the wrong sign");
                         }
-                    } else {
-                        signs += 1;
-                        largest_signed = largest_signed.max(truth);
                     }
                 }
             }
+            println!(
+                "{name}, renormalised: {renormalized}: ours within {ours_off:.1e} voxels of the truth; of OpenVDB's {compared} voxels \
+                 {apart} are over 1e-3 from ours, by up to {worst:.1e} ({beside:.1e} within 1.5 voxels of the surface); {signs} signed \
+                 otherwise"
+            );
+            assert!(ours_off <= 1e-5, "{name}: {ours_off} voxels off the truth");
+            assert_eq!(missing, 0, "{name}: voxels missing from the band");
+            assert!(worst <= 1.0 && 2 * apart <= compared, "{name}: {apart} of {compared} apart, up to {worst}");
+            if !renormalized {
+                assert!(beside <= 1e-4, "{name}: {beside} voxels within 1.5 voxels of the surface");
+                assert!(too_small <= 1e-4, "{name}: nearer than the closest triangle by {too_small} voxels");
+            }
         }
-        let active = ours.grid().active_voxels();
-        println!(
-            "{name}: ours within {ours_off:.1e} voxels of the truth; OpenVDB's within {beside:.1e} of ours beside the surface; farther out \
-             {apart} of {compared} are over 1e-3 apart (up to {worst:.1e}); of {active} active voxels {signs} are signed otherwise \
-             (up to {largest_signed:.1e} voxels from the surface), {only_one} active in one only"
-        );
-        assert!(ours_off <= 1e-3, "{name}: {ours_off} voxels off the truth");
-        assert!(gross * 20 <= compared, "{name}: {gross} of {compared} are 0.05 voxel apart");
-        assert!(signs * 200 <= active, "{name}: {signs} of {active} are signed otherwise");
-        if ["sphere", "torus"].contains(&name) {
-            assert!(beside <= 0.05, "{name}: {beside} voxels beside the surface");
-            assert!(largest_signed <= 0.05, "{name}: signs differ {largest_signed} voxels from the surface");
-        }
-        assert_eq!(ours_missing, 0, "{name}: voxels missing from the band");
-        assert!(only_one <= active / 500, "{name}: {only_one} active in one only");
     }
 }
 

@@ -102,9 +102,10 @@ fn a_turned_cube_loses_less_at_its_edges() {
                 q.max(DVec3::ZERO).length() + q.max_element().min(0.0)
             },
         );
-        // Up to half a voxel is cut off each of the 12 edges: a chamfer of that depth is √2 wide where faces had 2 √2 / 2.
+        // A polygon that cuts an edge off spans a cell: at most its diagonal, √3 voxels. Over a right angle that loses at most
+        // (√2 − 1)·√3 of the width of the faces and 3/4 of the cross-section, along 12 edges.
         let [ours, theirs] = found;
-        assert!(ours.area.abs() < 0.5 / half && ours.volume.abs() < 0.5 / (half * half), "{ours:?}");
+        assert!(ours.area.abs() < 0.72 / half && ours.volume.abs() < 2.25 / (half * half), "{ours:?}");
         assert!(ours.area.abs() < theirs.area.abs() && ours.volume.abs() < theirs.volume.abs(), "{ours:?} {theirs:?}");
     }
 }

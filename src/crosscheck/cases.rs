@@ -97,8 +97,8 @@ pub(super) const CASES: &[Case] = &[
     },
     Case {
         operator: "mesh-to-level-set",
-        scheme: "half width of the input, closed",
-        tolerance: 1e-3,
+        scheme: "half width of the input, closed; both against the mesh",
+        tolerance: FROM_MESH,
         contest: from_mesh,
     },
     Case {
@@ -115,6 +115,9 @@ pub(super) const CASES: &[Case] = &[
         contest: |input| Writing::new(input),
     },
 ];
+
+/// What a distance to a mesh may be off, in voxels.
+const FROM_MESH: f64 = 1e-3;
 
 const FIRST: Tracker = Tracker { scheme: ReferenceScheme::First, runge_kutta: 1, normalizations: 1 };
 const WENO5: Tracker = Tracker { scheme: ReferenceScheme::HjWeno5, runge_kutta: 1, normalizations: 1 };
@@ -321,9 +324,11 @@ fn from_mesh<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let (points, triangles): (Vec<Vec3>, _) =
         (mesh.positions.iter().map(|p| p.as_vec3()).collect(), mesh.triangles.clone());
     let (params, run) = (MeshToLevelSet { half_width, ..MeshToLevelSet::new(voxel_size) }, input.run.clone());
+    let mut in_voxels = mesh.clone();
+    in_voxels.positions.iter_mut().for_each(|p| *p /= voxel_size);
     GridContest::new(
         input,
-        Judge::SignedAlike,
+        Judge::Mesh { mesh: in_voxels, tolerance: FROM_MESH },
         Operation::new(move |_| Ok(mesh_to_level_set(&mesh, &params, &run)?.0)),
         Operation::new(move |_: &ReferenceGrid| {
             ReferenceGrid::from_mesh(&points, &triangles, Transform::uniform(voxel_size), half_width)

@@ -305,12 +305,11 @@ impl<'a> IsoSurface<'a> {
     /// Whether a vertex lies on a grid edge of an absent leaf: space of both signs meets there without a leaf between, and the
     /// surface cannot be followed. Never on a valid level set.
     pub fn is_torn(&self) -> bool {
-        let torn = |leaf: &SurfaceLeaf| {
+        let torn = |vertices: &mut CellVertices, leaf: &SurfaceLeaf| {
             let around = &self.grid.neighbours()[leaf.id.index()];
             if (1..8).all(|c| !around[neighbour_index(corner(c))].is_sentinel()) {
                 return false;
             }
-            let mut vertices = CellVertices::new();
             vertices.take(self, leaf);
             let mut torn = false;
             self.rows(leaf).for_each_cell(|cell, pattern| {
@@ -319,7 +318,7 @@ impl<'a> IsoSurface<'a> {
             });
             torn
         };
-        self.leaves.par_iter().with_min_len(16).any(torn)
+        self.leaves.par_iter().with_min_len(16).map_init(CellVertices::new, torn).any(|torn| torn)
     }
 
     /// A voxel of this leaf whose sign differs from that of the absent leaf next to it: the surface leaves the stored

@@ -149,6 +149,7 @@ pub(super) mod ffi {
             triangles: &[u32],
             matrix: &[f64],
             half_width: f32,
+            renormalize: bool,
         ) -> Result<UniquePtr<FloatGrid>>;
         fn volume_to_mesh(grid: &FloatGrid, iso: f64, adaptivity: f64) -> Result<UniquePtr<RawMesh>>;
         fn level_set_area(grid: &FloatGrid) -> Result<f64>;

@@ -144,8 +144,30 @@ impl ReferenceGrid {
 
     /// OpenVDB's meshToLevelSet: triangles in world space, half width in voxels.
     pub fn from_mesh(points: &[Vec3], triangles: &[[u32; 3]], transform: Transform, half_width: f32) -> Result<Self> {
+        Self::converted(points, triangles, transform, half_width, true)
+    }
+
+    /// As [`from_mesh`](Self::from_mesh), without what it does to the distances in the end (`DISABLE_RENORMALIZATION`,
+    /// `DISABLE_INTERSECTING_VOXEL_REMOVAL`).
+    pub fn from_mesh_unnormalized(
+        points: &[Vec3],
+        triangles: &[[u32; 3]],
+        transform: Transform,
+        half_width: f32,
+    ) -> Result<Self> {
+        Self::converted(points, triangles, transform, half_width, false)
+    }
+
+    fn converted(
+        points: &[Vec3],
+        triangles: &[[u32; 3]],
+        transform: Transform,
+        half_width: f32,
+        renormalize: bool,
+    ) -> Result<Self> {
         let flat: Vec<f32> = points.iter().flat_map(|p| p.to_array()).collect();
-        let grid = ffi::mesh_to_level_set(&flat, triangles.as_flattened(), &matrix(&transform), half_width);
+        let grid =
+            ffi::mesh_to_level_set(&flat, triangles.as_flattened(), &matrix(&transform), half_width, renormalize);
         Ok(Self { grid: grid.map_err(failed)?, transform })
     }
 
