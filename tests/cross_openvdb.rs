@@ -178,28 +178,37 @@ fn renormalisation_and_track() {
     }
 }
 
+/// Two and three operands; three at once as OpenVDB's two after each other.
 #[test]
 fn csg_is_the_same_to_the_last_bit() {
     for (name, a) in subjects() {
-        // Half its size away.
+        // Half its size away, along the diagonal and along x.
         let (lo, hi) = a.grid().active_bounds().unwrap();
-        let shift = (hi - lo).as_dvec3() * a.voxel_size() / 2.0;
-        let whole = (shift / a.voxel_size()).round() * a.voxel_size();
-        let b = a.moved(glam::DAffine3::from_translation(whole)).unwrap().renamed(a.transform()).unwrap();
-        let (ra, rb) = (ReferenceGrid::from_level_set(&a).unwrap(), ReferenceGrid::from_level_set(&b).unwrap());
+        let moved = |shift: DVec3| {
+            let whole = (shift / 2.0).round() * a.voxel_size();
+            a.moved(glam::DAffine3::from_translation(whole)).unwrap().renamed(a.transform()).unwrap()
+        };
+        let size = (hi - lo).as_dvec3();
+        let (b, c) = (moved(size), moved(size.with_y(0.0).with_z(3.0)));
+        let [ra, rb, rc] = [&a, &b, &c].map(|level_set| ReferenceGrid::from_level_set(level_set).unwrap());
         for (ours, theirs) in [
             (CsgOperation::Union, Csg::Union),
             (CsgOperation::Intersection, Csg::Intersection),
             (CsgOperation::Difference, Csg::Difference),
         ] {
-            let result = csg(&a, &b, ours);
-            let reference = ra.csg(&rb, theirs).unwrap().to_level_set().unwrap();
-            assert_same(&format!("{name} {ours:?}"), &result, &reference, 0.0);
-            // Signs away from the band as well.
-            let mut there = reference.grid().accessor();
-            for i in 0..20_000i32 {
-                let ijk = lo + (hi - lo) * 3 / 2 * IVec3::new(i % 27, i / 27 % 27, i / 729) / 27;
-                assert_eq!(result.grid().voxel(ijk).0 < 0.0, there.value(ijk) < 0.0, "{name} {ours:?} {ijk}");
+            let of_two = ra.csg(&rb, theirs).unwrap();
+            let of_three = of_two.csg(&rc, theirs).unwrap();
+            for (others, reference) in [(&[&b][..], of_two), (&[&b, &c], of_three)] {
+                let name = format!("{name} {ours:?} of {}", 1 + others.len());
+                let result = csg(&a, others, ours, &RunOptions::default()).unwrap();
+                let reference = reference.to_level_set().unwrap();
+                assert_same(&name, &result, &reference, 0.0);
+                // Signs away from the band as well.
+                let mut there = reference.grid().accessor();
+                for i in 0..20_000i32 {
+                    let ijk = lo + (hi - lo) * 3 / 2 * IVec3::new(i % 27, i / 27 % 27, i / 729) / 27;
+                    assert_eq!(result.grid().voxel(ijk).0 < 0.0, there.value(ijk) < 0.0, "{name} {ijk}");
+                }
             }
         }
     }
@@ -378,11 +387,11 @@ fn mesh_to_level_set_is_exact_where_openvdb_is_not() {
     }
 }
 
-/// Area and signed volume of the triangles and halves of quadrilaterals, which OpenVDB turns the other way round.
+/// Area and signed volume of the polygons, which OpenVDB turns the other way round.
 fn area_and_volume(mesh: &ReferenceMesh) -> (f64, f64) {
-    let halves = mesh.quads.iter().flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]]);
-    let corners = |t: [u32; 3]| t.map(|v| mesh.points[v as usize].as_dvec3());
-    halves.chain(mesh.triangles.iter().copied()).map(corners).fold((0.0, 0.0), |(area, volume), [a, b, c]| {
+    let points = mesh.points().unwrap();
+    let corners = |t: [u32; 3]| t.map(|v| points[v as usize].as_dvec3());
+    mesh.all_triangles().unwrap().into_iter().map(corners).fold((0.0, 0.0), |(area, volume), [a, b, c]| {
         (area + (b - a).cross(c - a).length() / 2.0, volume + a.dot(b.cross(c)) / 6.0)
     })
 }

@@ -38,7 +38,7 @@ fn box_distance(p: DVec3, half: DVec3) -> f64 {
 fn subjects() -> Vec<(&'static str, LevelSet)> {
     let sphere = made(|p| p.distance(DVec3::new(0.03, -0.02, 0.01)) - 1.2);
     let block = made(|p| box_distance(p - DVec3::new(0.2, 0.0, 0.05), DVec3::new(1.0, 0.7, 0.5)));
-    let union = csg(&sphere, &block, CsgOperation::Difference);
+    let union = csg(&sphere, &[&block], CsgOperation::Difference, &RunOptions::default()).unwrap();
     vec![("sphere", sphere), ("box", block), ("difference", union)]
 }
 

@@ -4,6 +4,8 @@ use glam::Vec3;
 
 use super::Input;
 use super::contest::{Contest, GridContest, Judge, Operation};
+use super::files::{Reading, Writing};
+use super::polygons::Polygonising;
 use crate::error::{EditError, Result};
 use crate::grid::{Transform, offset_to_local};
 use crate::levelset::{LevelSet, sweep_distance};
@@ -98,6 +100,19 @@ pub(super) const CASES: &[Case] = &[
         scheme: "half width of the input, closed; both against the mesh",
         tolerance: FROM_MESH,
         contest: from_mesh,
+    },
+    Case {
+        operator: "level-set-to-mesh",
+        scheme: "against volumeToMesh, adaptivity 0; distance of its vertices",
+        tolerance: 1.0,
+        contest: |input| Polygonising::new(input),
+    },
+    Case { operator: "read", scheme: "blosc, float", tolerance: 0.0, contest: |input| Reading::new(input) },
+    Case {
+        operator: "write",
+        scheme: "blosc, float; ours flushed and verified",
+        tolerance: 0.0,
+        contest: |input| Writing::new(input),
     },
 ];
 
@@ -261,11 +276,11 @@ fn morph<'a>(input: &'a Input<'a>) -> Sides<'a> {
 
 fn csg_union<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let shifted = shifted(input.level_set)?;
-    let reference = ReferenceGrid::from_level_set(&shifted)?;
+    let (reference, run) = (ReferenceGrid::from_level_set(&shifted)?, input.run.clone());
     GridContest::new(
         input,
         Judge::Equal,
-        Operation::new(move |grid| Ok(csg(grid, &shifted, CsgOperation::Union))),
+        Operation::new(move |grid| csg(grid, &[&shifted], CsgOperation::Union, &run)),
         Operation::new(move |grid: &ReferenceGrid| grid.csg(&reference, Csg::Union)),
     )
 }

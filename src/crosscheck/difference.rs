@@ -23,6 +23,15 @@ pub(super) struct Difference {
     pub openvdb_max: Option<f64>,
     /// How the two compare with each other, where both are held against a mesh.
     pub mutual: Option<Mutual>,
+    /// Of meshes: area and volume of ours over OpenVDB's, less 1.
+    pub area: Option<f64>,
+    pub volume: Option<f64>,
+    /// The same of ours and of OpenVDB's over the mesh that the level set was made from.
+    pub area_to_source: Option<[f64; 2]>,
+    pub volume_to_source: Option<[f64; 2]>,
+    /// Of files: the number of leaves, and the time that copying one to OpenVDB takes.
+    pub leaves: Option<f64>,
+    pub copy_us_a_leaf: Option<f64>,
 }
 
 impl Difference {

@@ -8,6 +8,7 @@
 //! origins and does not.
 
 mod accessor;
+mod combine;
 mod leaf;
 mod leaf_set;
 mod page_pool;
@@ -22,6 +23,7 @@ use glam::IVec3;
 use rayon::prelude::*;
 
 pub use accessor::Accessor;
+pub use combine::{Combination, SignRule};
 pub use leaf::{Face, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset, leaf_origin, offset_to_local};
 pub use leaf_set::LeafSet;
 pub use paged::{LeafId, PAGE_LEAVES, PageLeaves, Paged};

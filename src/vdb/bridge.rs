@@ -74,6 +74,9 @@ pub(super) mod ffi {
         fn grid_header(self: &Archive, index: usize) -> Result<GridHeader>;
         fn read_path(path: &[u8], headers_only: bool) -> Result<UniquePtr<Archive>>;
         fn read_bytes(bytes: &[u8], headers_only: bool) -> Result<UniquePtr<Archive>>;
+        fn fingerprint_path(path: &[u8]) -> Result<UniquePtr<Archive>>;
+        fn fingerprint_bytes(bytes: &[u8]) -> Result<UniquePtr<Archive>>;
+        fn release_voxels(archive: Pin<&mut Archive>, index: usize) -> Result<()>;
         fn grid_fingerprint(archive: &Archive, index: usize) -> Result<String>;
 
         type Leaves;
@@ -112,6 +115,9 @@ pub(super) mod ffi {
         fn write_bytes(self: Pin<&mut Output>, compression: u32) -> Result<UniquePtr<CxxString>>;
         fn seal(self: Pin<&mut Output>) -> Result<()>;
         fn verify(self: &Output, archive: &Archive) -> Result<String>;
+
+        fn plain_write(grid: &FloatGrid, path: &[u8]) -> Result<()>;
+        fn plain_read(path: &[u8]) -> Result<UniquePtr<FloatGrid>>;
 
         type RawMesh;
         fn point_count(self: &RawMesh) -> usize;
