@@ -9,6 +9,9 @@ use rustc_hash::FxHashMap;
 /// Triangles looked at in one task.
 const CHUNK: usize = 4096;
 
+/// The tiles met by some triangles, and each of these with the number of a tile in that list.
+type Chunk<K> = (Vec<K>, Vec<(u32, u32)>);
+
 /// The triangles that touch each tile, tiles in the order of their keys, triangles in that of their numbers.
 pub(crate) struct Bins<K> {
     keys: Vec<K>,
@@ -20,8 +23,7 @@ pub(crate) struct Bins<K> {
 impl<K: Copy + Ord + Hash + Send + Sync> Bins<K> {
     /// Asks `touched` for the tiles of each of `count` triangles, which it adds to a list, each once.
     pub fn new(count: usize, touched: impl Fn(usize, &mut Vec<K>) + Sync) -> Self {
-        // By chunk: the keys met, and each triangle with the number of its key in that list.
-        let chunks: Vec<(Vec<K>, Vec<(u32, u32)>)> = (0..count.div_ceil(CHUNK))
+        let chunks: Vec<Chunk<K>> = (0..count.div_ceil(CHUNK))
             .into_par_iter()
             .map(|chunk| {
                 let mut numbers: FxHashMap<K, u32> = FxHashMap::default();

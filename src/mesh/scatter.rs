@@ -372,8 +372,8 @@ impl LocalFrame {
         let along_z = Lanes::from_slice(simd, &[0., 1., 2., 3., 4., 5., 6., 7., 0., 1., 2., 3., 4., 5., 6., 7.]);
         let along_y = Lanes::from_slice(simd, &[0., 0., 0., 0., 0., 0., 0., 0., 1., 1., 1., 1., 1., 1., 1., 1.]);
         let mut lanes = [Lanes::splat(simd, 0.0); 7];
-        for k in 0..7 {
-            lanes[k] = along_z * self.gradients[2][k] + along_y * self.gradients[1][k];
+        for (k, lane) in lanes.iter_mut().enumerate() {
+            *lane = along_z * self.gradients[2][k] + along_y * self.gradients[1][k];
         }
         let gradients = [
             f32x8::from_slice(simd, &self.gradients[0]),

@@ -48,10 +48,6 @@ impl DistanceLeaves {
         &self.leaves
     }
 
-    pub fn into_leaves(self) -> Vec<UnsignedLeaf> {
-        self.leaves
-    }
-
     /// Lowers the distances to those of `other`.
     pub fn merge(&mut self, other: Vec<UnsignedLeaf>) {
         for leaf in other {

@@ -83,11 +83,6 @@ impl<'a> Inside<'a> {
         Self { crossings, tree: caps, caps: WindingNumber::new(caps).exact_nearby(), rim }
     }
 
-    /// Places where the integer winding number is neither 0 nor 1: see [`Crossings::overlaps`].
-    pub fn overlaps(&self) -> &[IVec3] {
-        self.crossings.overlaps()
-    }
-
     /// Whether the integer winding number decides in a cube of voxels.
     pub fn is_integer(&self, start: IVec3, edge: i32) -> bool {
         // Half the diagonal of the lattice of the cube's voxels, √3/2 · (edge − 1), rounded up.
