@@ -46,6 +46,7 @@ fn measure(across: u32) -> Result<()> {
     row("shape", &level_set, before, || sphere(across, &run))?;
     let one_step = |method, scheme| Smooth {
         method,
+        width: None,
         evolution: EvolutionOptions { iterations: Some(1), scheme: Some(scheme), ..EvolutionOptions::default() },
     };
     in_place("smooth, curvature, first order, one step", &level_set, |grid| {
@@ -57,7 +58,7 @@ fn measure(across: u32) -> Result<()> {
     in_place("renormalize, first order", &level_set, |grid| Ok(renormalize(grid, &SolverOptions::FIRST_ORDER, &run)?))?;
     in_place("track, first order", &level_set, |grid| Ok(track(grid, &SolverOptions::FIRST_ORDER, &run)?))?;
     row("csg union with itself", &level_set, MEMORY.current_usage(), || {
-        Ok(csg(&level_set, &level_set.clone(), CsgOperation::Union))
+        Ok(csg(&level_set, &[&level_set.clone()], CsgOperation::Union, &run)?)
     })?;
     row("rebuild", &level_set, MEMORY.current_usage(), || Ok(rebuild(&level_set, &Rebuild::band(3.0), &run)?))?;
     row("offset by a voxel", &level_set, MEMORY.current_usage(), || {

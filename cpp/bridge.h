@@ -68,6 +68,14 @@ std::unique_ptr<Archive> read_path(rust::Slice<const std::uint8_t> path, bool he
 /// The same from memory.
 std::unique_ptr<Archive> read_bytes(rust::Slice<const std::uint8_t> bytes, bool headers_only);
 
+/// Lets go of the voxels of grid `index`; its name, metadata and transform stay.
+void release_voxels(Archive& archive, std::size_t index);
+
+/// Reads a whole file as `read_path` does and keeps only a fingerprint of each grid's voxels, for `Output::verify`.
+std::unique_ptr<Archive> fingerprint_path(rust::Slice<const std::uint8_t> path);
+/// The same from memory.
+std::unique_ptr<Archive> fingerprint_bytes(rust::Slice<const std::uint8_t> bytes);
+
 /// The leaves of one float or double grid, listed once, for bulk copies. Const calls may run in parallel.
 class Leaves {
 public:
@@ -144,7 +152,7 @@ public:
     std::unique_ptr<std::string> write_bytes(std::uint32_t compression);
     /// Lets go of the grids and keeps what `verify` compares with.
     void seal();
-    /// Empty when `archive` holds what was written, else what differs.
+    /// Empty when `archive`, of fingerprints, holds what was written, else what differs.
     rust::String verify(const Archive& archive) const;
 
     std::unique_ptr<Impl> impl;
@@ -154,6 +162,13 @@ std::unique_ptr<Output> new_output();
 
 /// 128 bits that are equal for grids of equal topology and values (after rounding, for grids stored as half).
 rust::String grid_fingerprint(const Archive& archive, std::size_t index);
+
+// --- OpenVDB's own files, in reference_io.cc ---
+
+/// Writes a grid with blosc through openvdb::io::File: neither flushed to the disk nor verified.
+void plain_write(const FloatGrid& grid, rust::Slice<const std::uint8_t> path);
+/// Reads the first float grid of a file through openvdb::io::File, voxels included.
+std::unique_ptr<FloatGrid> plain_read(rust::Slice<const std::uint8_t> path);
 
 // --- OpenVDB's own tools, in reference.cc ---
 
@@ -189,7 +204,7 @@ std::unique_ptr<FloatGrid> csg_intersection(const FloatGrid& a, const FloatGrid&
 std::unique_ptr<FloatGrid> csg_difference(const FloatGrid& a, const FloatGrid& b);
 std::unique_ptr<FloatGrid> level_set_rebuild(const FloatGrid& grid, float iso, float half_width);
 std::unique_ptr<FloatGrid> mesh_to_level_set(rust::Slice<const float> points, rust::Slice<const std::uint32_t> triangles,
-    rust::Slice<const double> matrix, float half_width);
+    rust::Slice<const double> matrix, float half_width, bool renormalize);
 std::unique_ptr<RawMesh> volume_to_mesh(const FloatGrid& grid, double iso, double adaptivity);
 double level_set_area(const FloatGrid& grid);
 double level_set_volume(const FloatGrid& grid);

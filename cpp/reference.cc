@@ -125,7 +125,7 @@ std::unique_ptr<FloatGrid> level_set_rebuild(const FloatGrid& grid, float iso, f
 }
 
 std::unique_ptr<FloatGrid> mesh_to_level_set(rust::Slice<const float> points, rust::Slice<const std::uint32_t> triangles,
-    rust::Slice<const double> matrix, float half_width)
+    rust::Slice<const double> matrix, float half_width, bool renormalize)
 {
     const QuietOutput scope;
     initialize();
@@ -141,7 +141,13 @@ std::unique_ptr<FloatGrid> mesh_to_level_set(rust::Slice<const float> points, ru
         }
     }
     const auto transform = linear_transform(matrix);
-    return wrap(openvdb::tools::meshToLevelSet<openvdb::FloatGrid>(*transform, vertices, faces, half_width));
+    if (renormalize) {
+        return wrap(openvdb::tools::meshToLevelSet<openvdb::FloatGrid>(*transform, vertices, faces, half_width));
+    }
+    for (auto& vertex : vertices) vertex = openvdb::Vec3s(transform->worldToIndex(vertex));
+    const openvdb::tools::QuadAndTriangleDataAdapter<openvdb::Vec3s, openvdb::Vec3I> mesh(vertices, faces);
+    return wrap(openvdb::tools::meshToVolume<openvdb::FloatGrid>(mesh, *transform, half_width, half_width,
+        openvdb::tools::DISABLE_RENORMALIZATION | openvdb::tools::DISABLE_INTERSECTING_VOXEL_REMOVAL));
 }
 
 struct RawMesh::Impl {

@@ -199,6 +199,8 @@ fn operators_say_what_they_need() {
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--iterations", "1.5"], "whole number"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--time", "-1"], "time"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--method", "magic"], "laplacian"),
+        (vec!["smooth", "a.vdb", "-o", "b.vdb", "--method", "mean", "--width", "9"], "1 to 8"),
+        (vec!["smooth", "a.vdb", "-o", "b.vdb", "--width", "1"], "median"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--region", "spere radius=1"], "`sphere`"),
         (vec!["csg", "union", "a.vdb", "-o", "b.vdb"], "2 values"),
         (vec!["csg", "xor", "a.vdb", "a.vdb", "-o", "b.vdb"], "difference"),

@@ -4,12 +4,14 @@
 use glam::{DVec3, IVec3};
 use vdb_edit::LevelSet;
 use vdb_edit::grid::Transform;
-use vdb_edit::mesh::{Bvh, MeshToLevelSet, Rebuild, TriangleMesh, level_set_to_mesh, mesh_to_level_set, read, rebuild};
+use vdb_edit::mesh::{
+    Bvh, MeshToLevelSet, Rebuild, TriangleMesh, WindingNumber, level_set_to_mesh, mesh_to_level_set, read, rebuild,
+};
 use vdb_edit::ops::csg::{CsgOperation, csg};
 use vdb_edit::ops::morphology::offset;
 use vdb_edit::ops::smooth::{Smooth, SmoothMethod, smooth};
 use vdb_edit::ops::{EvolutionOptions, Like, Scheme};
-use vdb_edit::pde::{SolverOptions, UpwindScheme, WenoEpsilon, renormalize, track};
+use vdb_edit::pde::{self, SolverOptions, UpwindScheme, WenoEpsilon, renormalize, track};
 use vdb_edit::run::RunOptions;
 use vdb_edit::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceMesh, ReferenceScheme, Tracker};
 
@@ -85,7 +87,7 @@ const FIRST: Tracker = Tracker { scheme: ReferenceScheme::First, runge_kutta: 1,
 
 fn smoothed(level_set: &LevelSet, method: SmoothMethod, evolution: EvolutionOptions) -> LevelSet {
     let mut ours = level_set.clone();
-    smooth(&mut ours, &Smooth { method, evolution }, &RunOptions::default()).unwrap();
+    smooth(&mut ours, &Smooth { method, evolution, ..Smooth::default() }, &RunOptions::default()).unwrap();
     ours
 }
 
@@ -100,6 +102,43 @@ fn curvature_and_laplacian_steps_with_track() {
         assert_same(name, &ours, &reference(&level_set, Filter::Laplacian(1), FIRST), 1e-5);
         let ours = smoothed(&level_set, SmoothMethod::Curvature, like.clone());
         assert_same(name, &ours, &reference(&level_set, Filter::MeanCurvature(1), Tracker::default()), 1e-5);
+    }
+}
+
+#[test]
+fn filters_with_track() {
+    let first =
+        EvolutionOptions { scheme: Some(Scheme::First), normalizations: Some(1), ..EvolutionOptions::default() };
+    let like = EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() };
+    for (name, level_set) in subjects() {
+        for (method, width, filter) in [
+            (SmoothMethod::Mean, 1, Filter::Mean(1)),
+            (SmoothMethod::Mean, 3, Filter::Mean(3)),
+            (SmoothMethod::Gaussian, 1, Filter::Gaussian(1)),
+            (SmoothMethod::Median, 1, Filter::Median(1)),
+            (SmoothMethod::Median, 2, Filter::Median(2)),
+        ] {
+            for (evolution, tracker) in [(&first, FIRST), (&like, Tracker::default())] {
+                let params = Smooth { method, width: Some(width), evolution: evolution.clone() };
+                let mut ours = level_set.clone();
+                smooth(&mut ours, &params, &RunOptions::default()).unwrap();
+                let name = format!("{name} {filter:?}");
+                assert_same(&name, &ours, &reference(&level_set, filter, tracker), 1e-4);
+            }
+        }
+    }
+}
+
+#[test]
+fn offsets_by_the_flow() {
+    for (name, level_set) in subjects() {
+        for voxels in [1.0, -1.0, 0.7] {
+            let distance = voxels * level_set.voxel_size();
+            let mut ours = level_set.clone();
+            pde::offset(&mut ours, distance, None, &SolverOptions::OPENVDB, &RunOptions::default()).unwrap();
+            let theirs = reference(&level_set, Filter::Offset(distance as f32), Tracker::default());
+            assert_same(&format!("{name} {voxels}"), &ours, &theirs, 1e-4);
+        }
     }
 }
 
@@ -139,28 +178,37 @@ fn renormalisation_and_track() {
     }
 }
 
+/// Two and three operands; three at once as OpenVDB's two after each other.
 #[test]
 fn csg_is_the_same_to_the_last_bit() {
     for (name, a) in subjects() {
-        // Half its size away.
+        // Half its size away, along the diagonal and along x.
         let (lo, hi) = a.grid().active_bounds().unwrap();
-        let shift = (hi - lo).as_dvec3() * a.voxel_size() / 2.0;
-        let whole = (shift / a.voxel_size()).round() * a.voxel_size();
-        let b = a.moved(glam::DAffine3::from_translation(whole)).unwrap().renamed(a.transform()).unwrap();
-        let (ra, rb) = (ReferenceGrid::from_level_set(&a).unwrap(), ReferenceGrid::from_level_set(&b).unwrap());
+        let moved = |shift: DVec3| {
+            let whole = (shift / 2.0).round() * a.voxel_size();
+            a.moved(glam::DAffine3::from_translation(whole)).unwrap().renamed(a.transform()).unwrap()
+        };
+        let size = (hi - lo).as_dvec3();
+        let (b, c) = (moved(size), moved(size.with_y(0.0).with_z(3.0)));
+        let [ra, rb, rc] = [&a, &b, &c].map(|level_set| ReferenceGrid::from_level_set(level_set).unwrap());
         for (ours, theirs) in [
             (CsgOperation::Union, Csg::Union),
             (CsgOperation::Intersection, Csg::Intersection),
             (CsgOperation::Difference, Csg::Difference),
         ] {
-            let result = csg(&a, &b, ours);
-            let reference = ra.csg(&rb, theirs).unwrap().to_level_set().unwrap();
-            assert_same(&format!("{name} {ours:?}"), &result, &reference, 0.0);
-            // Signs away from the band as well.
-            let mut there = reference.grid().accessor();
-            for i in 0..20_000i32 {
-                let ijk = lo + (hi - lo) * 3 / 2 * IVec3::new(i % 27, i / 27 % 27, i / 729) / 27;
-                assert_eq!(result.grid().voxel(ijk).0 < 0.0, there.value(ijk) < 0.0, "{name} {ours:?} {ijk}");
+            let of_two = ra.csg(&rb, theirs).unwrap();
+            let of_three = of_two.csg(&rc, theirs).unwrap();
+            for (others, reference) in [(&[&b][..], of_two), (&[&b, &c], of_three)] {
+                let name = format!("{name} {ours:?} of {}", 1 + others.len());
+                let result = csg(&a, others, ours, &RunOptions::default()).unwrap();
+                let reference = reference.to_level_set().unwrap();
+                assert_same(&name, &result, &reference, 0.0);
+                // Signs away from the band as well.
+                let mut there = reference.grid().accessor();
+                for i in 0..20_000i32 {
+                    let ijk = lo + (hi - lo) * 3 / 2 * IVec3::new(i % 27, i / 27 % 27, i / 729) / 27;
+                    assert_eq!(result.grid().voxel(ijk).0 < 0.0, there.value(ijk) < 0.0, "{name} {ijk}");
+                }
             }
         }
     }
@@ -275,75 +323,75 @@ fn meshes() -> Vec<(&'static str, TriangleMesh, f64)> {
     ]
 }
 
-/// Our magnitudes are exact: the tree that looks for the closest triangle of each voxel says so (1e-3 voxel is asserted, the tolerance
-/// of `crosscheck`). OpenVDB's differ from them by 7e-6 voxel on an octahedral sphere, 0.03 on a torus and up to 0.7 beside the surface
-/// of models, with some signs; why is not known (it renormalises last of all, and passes the closest triangle on from voxel to
-/// voxel). So it is asked to agree roughly: on smooth meshes 0.05 voxel beside the surface and signs alike farther from it, on models
-/// 95 % of the band, and no voxel active there that we miss but for those within 1e-4 voxel of the band's rim.
+/// A mesh converted by OpenVDB differs from ours by up to 0.7 voxel, and it is not ours that is off: the distance to the
+/// closest triangle, looked up for every voxel, and the winding number of the mesh, wherever the signs differ, say so.
+///
+/// Two things move OpenVDB's values. Last of all it renormalises: without that it agrees with us within 1e-5 near the
+/// surface. And from 1.8 voxels on it asks only the triangles that were closest for voxels nearby, so that its distances are
+/// never smaller than the true ones but up to 0.9 voxel larger.
 #[test]
-fn mesh_to_level_set_is_that_of_openvdb() {
+fn mesh_to_level_set_is_exact_where_openvdb_is_not() {
     for (name, mesh, voxel_size) in meshes() {
         let (ours, _) = mesh_to_level_set(&mesh, &MeshToLevelSet::new(voxel_size), &RunOptions::default()).unwrap();
         let points: Vec<_> = mesh.positions.iter().map(|p| p.as_vec3()).collect();
-        let theirs =
-            ReferenceGrid::from_mesh(&points, &mesh.triangles, *ours.transform(), 3.0).unwrap().to_level_set().unwrap();
         let tree = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t).map(|p| p / voxel_size)).collect());
-        let exact =
-            |ijk: IVec3| tree.closest_point(ijk.as_dvec3(), 10.0).map_or(10.0, |hit| hit.distance_squared.sqrt());
-        let (mut compared, mut apart, mut worst, mut ours_off) = (0u64, 0u64, 0f64, 0f64);
-        let (mut signs, mut only_one, mut ours_missing) = (0u64, 0u64, 0u64);
-        let (mut beside, mut largest_signed, mut gross) = (0f64, 0f64, 0u64);
-        let mut ours_at = ours.grid().accessor();
-        let mut theirs_at = theirs.grid().accessor();
-        for grid in [ours.grid(), theirs.grid()] {
-            for &id in grid.leaves() {
-                for at in grid.mask(id).iter() {
-                    let ijk = grid.origin(id) + vdb_edit::grid::offset_to_local(at);
-                    let (a, b) = (f64::from(ours_at.value(ijk)), f64::from(theirs_at.value(ijk)));
-                    let truth = exact(ijk).min(3.0);
-                    ours_off = ours_off.max((a.abs() / voxel_size - truth).abs());
-                    if ours_at.is_active(ijk) != theirs_at.is_active(ijk) {
-                        only_one += 1;
-                        ours_missing += u64::from(!ours_at.is_active(ijk) && truth < 3.0 - 1e-4);
-                    } else if (a < 0.0) == (b < 0.0) {
-                        let difference = (a - b).abs() / voxel_size;
-                        compared += 1;
-                        apart += u64::from(difference > 1e-3);
-                        gross += u64::from(difference > 0.05);
-                        worst = worst.max(difference);
-                        if truth <= 1.0 {
-                            beside = beside.max(difference);
+        let winding = WindingNumber::new(&tree);
+        let default = ReferenceGrid::from_mesh(&points, &mesh.triangles, *ours.transform(), 3.0).unwrap();
+        let plain = ReferenceGrid::from_mesh_unnormalized(&points, &mesh.triangles, *ours.transform(), 3.0).unwrap();
+        for (theirs, renormalized) in [(default, true), (plain, false)] {
+            let theirs = theirs.to_level_set().unwrap();
+            let (mut compared, mut apart, mut worst, mut beside) = (0u64, 0u64, 0f64, 0f64);
+            let (mut ours_off, mut too_small, mut signs, mut missing) = (0f64, 0f64, 0u64, 0u64);
+            let (mut ours_at, mut theirs_at) = (ours.grid().accessor(), theirs.grid().accessor());
+            for grid in [ours.grid(), theirs.grid()] {
+                for &id in grid.leaves() {
+                    for at in grid.mask(id).iter() {
+                        let ijk = grid.origin(id) + vdb_edit::grid::offset_to_local(at);
+                        let [a, b] =
+                            [ours_at.value(ijk), theirs_at.value(ijk)].map(|value| f64::from(value) / voxel_size);
+                        let hit = tree.closest_point(ijk.as_dvec3(), 10.0);
+                        let truth = hit.map_or(10.0, |hit| hit.distance_squared.sqrt()).min(3.0);
+                        ours_off = ours_off.max((a.abs() - truth).abs());
+                        if !ours_at.is_active(ijk) || !theirs_at.is_active(ijk) {
+                            missing += u64::from(!ours_at.is_active(ijk) && truth < 3.0 - 1e-4);
+                        } else if (a < 0.0) == (b < 0.0) {
+                            compared += 1;
+                            apart += u64::from((a - b).abs() > 1e-3);
+                            worst = worst.max((a - b).abs());
+                            too_small = too_small.max(truth - b.abs());
+                            if truth <= 1.5 {
+                                beside = beside.max((a - b).abs());
+                            }
+                        } else {
+                            signs += 1;
+                            // On the surface itself either sign is right.
+                            let inside = winding.at(ijk.as_dvec3()) > 0.5;
+                            assert!(truth < 1e-5 || inside == (a < 0.0), "{name}: {ijk} has the wrong sign");
                         }
-                    } else {
-                        signs += 1;
-                        largest_signed = largest_signed.max(truth);
                     }
                 }
             }
+            println!(
+                "{name}, renormalised: {renormalized}: ours within {ours_off:.1e} voxels of the truth; of OpenVDB's {compared} voxels \
+                 {apart} are over 1e-3 from ours, by up to {worst:.1e} ({beside:.1e} within 1.5 voxels of the surface); {signs} signed \
+                 otherwise"
+            );
+            assert!(ours_off <= 1e-5, "{name}: {ours_off} voxels off the truth");
+            assert_eq!(missing, 0, "{name}: voxels missing from the band");
+            assert!(worst <= 1.0 && 2 * apart <= compared, "{name}: {apart} of {compared} apart, up to {worst}");
+            if !renormalized {
+                assert!(beside <= 1e-4, "{name}: {beside} voxels within 1.5 voxels of the surface");
+                assert!(too_small <= 1e-4, "{name}: nearer than the closest triangle by {too_small} voxels");
+            }
         }
-        let active = ours.grid().active_voxels();
-        println!(
-            "{name}: ours within {ours_off:.1e} voxels of the truth; OpenVDB's within {beside:.1e} of ours beside the surface; farther out \
-             {apart} of {compared} are over 1e-3 apart (up to {worst:.1e}); of {active} active voxels {signs} are signed otherwise \
-             (up to {largest_signed:.1e} voxels from the surface), {only_one} active in one only"
-        );
-        assert!(ours_off <= 1e-3, "{name}: {ours_off} voxels off the truth");
-        assert!(gross * 20 <= compared, "{name}: {gross} of {compared} are 0.05 voxel apart");
-        assert!(signs * 200 <= active, "{name}: {signs} of {active} are signed otherwise");
-        if ["sphere", "torus"].contains(&name) {
-            assert!(beside <= 0.05, "{name}: {beside} voxels beside the surface");
-            assert!(largest_signed <= 0.05, "{name}: signs differ {largest_signed} voxels from the surface");
-        }
-        assert_eq!(ours_missing, 0, "{name}: voxels missing from the band");
-        assert!(only_one <= active / 500, "{name}: {only_one} active in one only");
     }
 }
 
-/// Area and signed volume of the triangles and halves of quadrilaterals, which OpenVDB turns the other way round.
+/// Area and signed volume of the polygons, which OpenVDB turns the other way round.
 fn area_and_volume(mesh: &ReferenceMesh) -> (f64, f64) {
-    let halves = mesh.quads.iter().flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]]);
-    let corners = |t: [u32; 3]| t.map(|v| mesh.points[v as usize].as_dvec3());
-    halves.chain(mesh.triangles.iter().copied()).map(corners).fold((0.0, 0.0), |(area, volume), [a, b, c]| {
+    let points = mesh.points().unwrap();
+    let corners = |t: [u32; 3]| t.map(|v| points[v as usize].as_dvec3());
+    mesh.all_triangles().unwrap().into_iter().map(corners).fold((0.0, 0.0), |(area, volume), [a, b, c]| {
         (area + (b - a).cross(c - a).length() / 2.0, volume + a.dot(b.cross(c)) / 6.0)
     })
 }

@@ -6,7 +6,7 @@ use vdb_edit::LevelSet;
 use vdb_edit::grid::{Transform, offset_to_local};
 use vdb_edit::ops::csg::{CsgOperation, csg};
 use vdb_edit::ops::{Arity, Entry, REGISTRY, find};
-use vdb_edit::region::parse_regions;
+use vdb_edit::region::RegionPlan;
 use vdb_edit::run::RunOptions;
 
 const DX: f64 = 0.1;
@@ -38,7 +38,7 @@ fn box_distance(p: DVec3, half: DVec3) -> f64 {
 fn subjects() -> Vec<(&'static str, LevelSet)> {
     let sphere = made(|p| p.distance(DVec3::new(0.03, -0.02, 0.01)) - 1.2);
     let block = made(|p| box_distance(p - DVec3::new(0.2, 0.0, 0.05), DVec3::new(1.0, 0.7, 0.5)));
-    let union = csg(&sphere, &block, CsgOperation::Difference);
+    let union = csg(&sphere, &[&block], CsgOperation::Difference, &RunOptions::default()).unwrap();
     vec![("sphere", sphere), ("box", block), ("difference", union)]
 }
 
@@ -249,13 +249,14 @@ fn a_cancelled_run_says_so() {
 /// Every voxel that was active and has weight 0 keeps its bits.
 #[test]
 fn nothing_happens_outside_the_region() {
-    let region = parse_regions(&[REGION.into()]).unwrap().unwrap();
+    let plan = RegionPlan::parse(&[REGION.into()]).unwrap().unwrap();
     let mut limited = 0;
     for entry in REGISTRY.iter().filter(|entry| entry.parameters().iter().any(|p| p.name == "region")) {
         limited += 1;
         for (name, subject) in subjects() {
             let mut values = needed(entry);
             values.insert("region".into(), json!(REGION));
+            let region = plan.on(&subject, &RunOptions::default()).unwrap();
             let result = run(entry, values, &subject);
             assert_eq!(result.check(), [], "{} of the {name}", entry.name);
             let (mut kept, mut changed) = (0, 0);

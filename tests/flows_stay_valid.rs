@@ -1,32 +1,30 @@
 //! What comes out of a flow is a level set again, by the checker's word.
 
+use fearless_simd::Simd;
 use glam::{DVec3, IVec3};
 use vdb_edit::LevelSet;
 use vdb_edit::grid::Transform;
 use vdb_edit::mesh::level_set_to_mesh;
-use vdb_edit::pde::{GradientNorm, LeafFields, SolverOptions, SpeedFunction, Until, WantedFields, evolve};
+use vdb_edit::pde::{SolverOptions, SpeedFunction, Until, evolve};
 use vdb_edit::run::RunOptions;
+use vdb_edit::stencil::Halo;
+use vdb_edit::stencil::curvature::mean_curvature;
+use vdb_edit::stencil::simd::Lanes;
 
 /// F = −H.
 struct MeanCurvature;
 
 impl SpeedFunction for MeanCurvature {
-    fn wants(&self) -> WantedFields {
-        WantedFields { mean_curvature: true, ..WantedFields::default() }
-    }
-
-    fn gradient_norm(&self) -> GradientNorm {
-        GradientNorm::Central
-    }
+    type Halo = Halo;
 
     fn largest_step(&self, voxel_size: f64) -> f64 {
         voxel_size * voxel_size / 3.0
     }
 
-    fn speed(&self, fields: &LeafFields, speed: &mut [f32; 512]) {
-        for (f, h) in speed.iter_mut().zip(&fields.mean_curvature) {
-            *f = -h;
-        }
+    #[inline(always)]
+    fn rate<S: Simd>(&self, simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
+        let at = mean_curvature(simd, halo, x, y, voxel_size);
+        -at.mean * at.gradient
     }
 }
 

@@ -111,20 +111,16 @@ fn csg_of_two_balls() {
 fn meshes_there_and_back() {
     let grid = reference();
     let mesh = grid.to_mesh(0.0, 0.0).unwrap();
-    assert!(mesh.quads.len() > 1000);
+    assert!(mesh.quads().unwrap().len() > 1000);
     // World units, on the sphere to a fraction of a voxel.
-    for p in &mesh.points {
+    let points = mesh.points().unwrap();
+    for p in &points {
         assert!((f64::from(p.length()) - R * DX).abs() < 0.1 * DX);
     }
-    let triangles: Vec<[u32; 3]> = mesh
-        .quads
-        .iter()
-        .flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]])
-        .chain(mesh.triangles.clone())
-        .collect();
-    let again = ReferenceGrid::from_mesh(&mesh.points, &triangles, Transform::uniform(DX), 3.0).unwrap();
+    let triangles = mesh.all_triangles().unwrap();
+    let again = ReferenceGrid::from_mesh(&points, &triangles, Transform::uniform(DX), 3.0).unwrap();
     assert!((radius(&again) - R).abs() < 0.1);
-    assert!(ReferenceGrid::from_mesh(&mesh.points, &[[0, 1, u32::MAX]], Transform::uniform(DX), 3.0).is_err());
+    assert!(ReferenceGrid::from_mesh(&points, &[[0, 1, u32::MAX]], Transform::uniform(DX), 3.0).is_err());
     let wide = grid.rebuild(0.0, 5.0).unwrap();
     assert!((wide.to_level_set().unwrap().half_width() - 5.0).abs() < 1e-5);
     assert!((radius(&wide) - R).abs() < 0.1);

@@ -185,9 +185,9 @@ pub fn load(
     for path in paths {
         context.run.check("reading")?;
         if is_volume(path) {
-            let volume = volume::open(path, &context.run)?;
+            let mut volume = volume::open(path, &context.run)?;
             warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
-            let grid = volume.read(options.choice(volumes))?;
+            let grid = volume.take(options.choice(volumes))?;
             volumes += 1;
             raw.push(Raw::Volume(Box::new((volume, grid))));
         } else {

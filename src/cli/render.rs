@@ -14,7 +14,7 @@ use super::{Verb, args, output};
 use crate::atomic::write_atomically;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
-use crate::region::{Region, parse_regions};
+use crate::region::{Region, RegionPlan};
 use crate::render::{CameraSpec, ColorBy, Frame, Image, RenderOptions, UpAxis, render};
 
 /// The command.
@@ -123,8 +123,8 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     options.validate()?;
     let color = matches.get_one::<Color>("color-by").cloned().unwrap_or(Color::Clay);
     let specs: Vec<String> = matches.get_many("region").map(|specs| specs.cloned().collect()).unwrap_or_default();
-    let region = parse_regions(&specs)?;
-    if (color == Color::Region) != region.is_some() {
+    let plan = RegionPlan::parse(&specs)?;
+    if (color == Color::Region) != plan.is_some() {
         let accepted = "`--color-by region` and one or more `--region SPEC` go together";
         return Err(EditError::parameter("render", "color_by", format!("{color:?}").to_lowercase(), accepted));
     }
@@ -143,6 +143,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let inputs = input::load(&all, &input_options, &mut warnings, context)?;
     warnings.iter().for_each(|warning| context.reporter.warn(warning));
     let Some(input) = inputs.first() else { return Ok(()) };
+    let region = plan.map(|plan| plan.on(&input.level_set, &context.run)).transpose()?;
     let components = match color {
         Color::Component => Some(input.level_set.components(&context.run)?),
         _ => None,

@@ -73,9 +73,19 @@ impl Volume {
     /// Reads the chosen level set.
     pub fn read(&self, choice: Choice) -> Result<VolumeGrid> {
         let read = self.file.read_level_set(choice.grid, choice.assume_level_set)?;
+        Ok(self.named(read))
+    }
+
+    /// Reads the chosen level set and lets go of its voxels in the file.
+    pub fn take(&mut self, choice: Choice) -> Result<VolumeGrid> {
+        let read = self.file.take_level_set(choice.grid, choice.assume_level_set)?;
+        Ok(self.named(read))
+    }
+
+    fn named(&self, read: ReadLevelSet) -> VolumeGrid {
         let selector = self.file.listing().grids[read.index].selector.clone();
         let band = band_state(&read);
-        Ok(VolumeGrid { level_set: read.level_set, index: read.index, selector, band })
+        VolumeGrid { level_set: read.level_set, index: read.index, selector, band }
     }
 
     /// The field whose zero set is the surface of a scalar volume at a value; its level set is still to be made.

@@ -56,6 +56,10 @@ pub fn set_threads(_: usize) -> Result<()> {
 }
 
 impl Volume {
+    pub fn take(&mut self, _: Choice) -> Result<VolumeGrid> {
+        match self.0 {}
+    }
+
     pub fn read(&self, _: Choice) -> Result<VolumeGrid> {
         match self.0 {}
     }

@@ -4,6 +4,8 @@ use glam::Vec3;
 
 use super::Input;
 use super::contest::{Contest, GridContest, Judge, Operation};
+use super::files::{Reading, Writing};
+use super::polygons::Polygonising;
 use crate::error::{EditError, Result};
 use crate::grid::{Transform, offset_to_local};
 use crate::levelset::{LevelSet, sweep_distance};
@@ -12,7 +14,9 @@ use crate::ops::csg::{CsgOperation, csg};
 use crate::ops::morphology::offset;
 use crate::ops::smooth::{Smooth, SmoothMethod, smooth};
 use crate::ops::{EvolutionOptions, Like, RegionSpecs, Scheme};
-use crate::pde::{MorphOptions, SolverOptions, Until, UpwindScheme, WenoEpsilon, morph_towards, renormalize, track};
+use crate::pde::{
+    self, MorphOptions, SolverOptions, Until, UpwindScheme, WenoEpsilon, morph_towards, renormalize, track,
+};
 use crate::region::Primitive;
 use crate::vdb::reference::{Csg, Filter, ReferenceGrid, ReferenceScheme, Tracker};
 
@@ -29,6 +33,8 @@ pub(super) struct Case {
 }
 
 const FIRST_STEP: &str = "one step and track, first order, RK1, 1";
+
+const FILTER: &str = "width 1, HJ-WENO5, RK1, 3";
 
 /// All rows, in order.
 pub(super) const CASES: &[Case] = &[
@@ -49,12 +55,16 @@ pub(super) const CASES: &[Case] = &[
     Case { operator: "normalize-first", scheme: "first order, RK1, 1", tolerance: 1e-5, contest: normalize_first },
     Case { operator: "normalize-weno5", scheme: "HJ-WENO5, RK1, 1", tolerance: 1e-5, contest: normalize_weno5 },
     Case { operator: "track", scheme: "HJ-WENO5, RK1, 3", tolerance: 1e-5, contest: whole_track },
+    Case { operator: "offset-pde", scheme: "one voxel, HJ-WENO5, RK1, 3", tolerance: 1e-4, contest: offset_by_flow },
     Case {
         operator: "offset",
         scheme: "one voxel: exact, against HJ-WENO5, RK1, 3",
         tolerance: 0.05,
         contest: exact_offset,
     },
+    Case { operator: "gaussian", scheme: FILTER, tolerance: 1e-4, contest: gaussian },
+    Case { operator: "mean", scheme: FILTER, tolerance: 1e-4, contest: mean },
+    Case { operator: "median", scheme: FILTER, tolerance: 1e-4, contest: median },
     Case {
         operator: "morph",
         scheme: "towards a copy one voxel larger, time 1, HJ-WENO5, RK2; track HJ-WENO5, RK1, 3",
@@ -87,11 +97,27 @@ pub(super) const CASES: &[Case] = &[
     },
     Case {
         operator: "mesh-to-level-set",
-        scheme: "half width of the input, closed",
-        tolerance: 1e-3,
+        scheme: "half width of the input, closed; both against the mesh",
+        tolerance: FROM_MESH,
         contest: from_mesh,
     },
+    Case {
+        operator: "level-set-to-mesh",
+        scheme: "against volumeToMesh, adaptivity 0; distance of its vertices",
+        tolerance: 1.0,
+        contest: |input| Polygonising::new(input),
+    },
+    Case { operator: "read", scheme: "blosc, float", tolerance: 0.0, contest: |input| Reading::new(input) },
+    Case {
+        operator: "write",
+        scheme: "blosc, float; ours flushed and verified",
+        tolerance: 0.0,
+        contest: |input| Writing::new(input),
+    },
 ];
+
+/// What a distance to a mesh may be off, in voxels.
+const FROM_MESH: f64 = 1e-3;
 
 const FIRST: Tracker = Tracker { scheme: ReferenceScheme::First, runge_kutta: 1, normalizations: 1 };
 const WENO5: Tracker = Tracker { scheme: ReferenceScheme::HjWeno5, runge_kutta: 1, normalizations: 1 };
@@ -109,7 +135,7 @@ fn same<'a>(
     GridContest::new(input, Judge::Equal, Operation::in_place(ours), theirs)
 }
 
-/// One step of a smoothing flow.
+/// One step of a smoothing flow, or one application of a filter.
 fn flow<'a>(
     input: &'a Input<'a>,
     method: SmoothMethod,
@@ -118,7 +144,7 @@ fn flow<'a>(
     tracker: Tracker,
 ) -> Sides<'a> {
     let evolution = EvolutionOptions { iterations: Some(1), ..evolution };
-    let (params, run) = (Smooth { method, evolution }, input.run.clone());
+    let (params, run) = (Smooth { method, evolution, ..Smooth::default() }, input.run.clone());
     same(input, move |grid| smooth(grid, &params, &run).map(drop), filter, tracker)
 }
 
@@ -148,7 +174,7 @@ fn masked_mean_curvature<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let radius = distances[(distances.len() as f64 * MASKED) as usize];
     let spec = format!("sphere center={},{},{} radius={radius}", centre.x, centre.y, centre.z);
     let evolution = EvolutionOptions { iterations: Some(1), region: RegionSpecs(vec![spec]), ..first_order() };
-    let region = evolution.region.parse()?;
+    let region = evolution.region.on(input.level_set, input.run)?;
     let mut weights = input.level_set.clone();
     weights.grid_mut().update_all(|id, values, _| {
         let origin = grid.origin(id);
@@ -173,9 +199,34 @@ fn laplacian<'a>(input: &'a Input<'a>) -> Sides<'a> {
     flow(input, SmoothMethod::Laplacian, first_order(), Filter::Laplacian(1), FIRST)
 }
 
+fn like_openvdb() -> EvolutionOptions {
+    EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() }
+}
+
 fn mean_curvature_default<'a>(input: &'a Input<'a>) -> Sides<'a> {
-    let like = EvolutionOptions { like: Some(Like::OpenVdb), ..EvolutionOptions::default() };
-    flow(input, SmoothMethod::Curvature, like, Filter::MeanCurvature(1), Tracker::default())
+    flow(input, SmoothMethod::Curvature, like_openvdb(), Filter::MeanCurvature(1), Tracker::default())
+}
+
+fn gaussian<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Gaussian, like_openvdb(), Filter::Gaussian(1), Tracker::default())
+}
+
+fn mean<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Mean, like_openvdb(), Filter::Mean(1), Tracker::default())
+}
+
+fn median<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    flow(input, SmoothMethod::Median, like_openvdb(), Filter::Median(1), Tracker::default())
+}
+
+fn offset_by_flow<'a>(input: &'a Input<'a>) -> Sides<'a> {
+    let (voxel, run) = (input.level_set.voxel_size(), input.run.clone());
+    same(
+        input,
+        move |grid| pde::offset(grid, voxel, None, &SolverOptions::OPENVDB, &run).map(drop),
+        Filter::Offset(voxel as f32),
+        Tracker::default(),
+    )
 }
 
 fn normalize_first<'a>(input: &'a Input<'a>) -> Sides<'a> {
@@ -225,11 +276,11 @@ fn morph<'a>(input: &'a Input<'a>) -> Sides<'a> {
 
 fn csg_union<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let shifted = shifted(input.level_set)?;
-    let reference = ReferenceGrid::from_level_set(&shifted)?;
+    let (reference, run) = (ReferenceGrid::from_level_set(&shifted)?, input.run.clone());
     GridContest::new(
         input,
         Judge::Equal,
-        Operation::new(move |grid| Ok(csg(grid, &shifted, CsgOperation::Union))),
+        Operation::new(move |grid| csg(grid, &[&shifted], CsgOperation::Union, &run)),
         Operation::new(move |grid: &ReferenceGrid| grid.csg(&reference, Csg::Union)),
     )
 }
@@ -273,9 +324,11 @@ fn from_mesh<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let (points, triangles): (Vec<Vec3>, _) =
         (mesh.positions.iter().map(|p| p.as_vec3()).collect(), mesh.triangles.clone());
     let (params, run) = (MeshToLevelSet { half_width, ..MeshToLevelSet::new(voxel_size) }, input.run.clone());
+    let mut in_voxels = mesh.clone();
+    in_voxels.positions.iter_mut().for_each(|p| *p /= voxel_size);
     GridContest::new(
         input,
-        Judge::SignedAlike,
+        Judge::Mesh { mesh: in_voxels, tolerance: FROM_MESH },
         Operation::new(move |_| Ok(mesh_to_level_set(&mesh, &params, &run)?.0)),
         Operation::new(move |_: &ReferenceGrid| {
             ReferenceGrid::from_mesh(&points, &triangles, Transform::uniform(voxel_size), half_width)

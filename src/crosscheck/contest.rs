@@ -5,9 +5,11 @@ use std::time::Instant;
 use glam::IVec3;
 
 use super::Input;
-use super::difference::Difference;
+use super::difference::{Difference, bvh};
 use crate::error::Result;
+use crate::grid::Transform;
 use crate::levelset::LevelSet;
+use crate::mesh::TriangleMesh;
 use crate::vdb::reference::ReferenceGrid;
 
 /// Both sides of a row. What is not part of the operation (copies, conversions, releasing old grids) is not timed.
@@ -56,10 +58,11 @@ impl<Grid> Operation<Grid> {
 pub(super) enum Judge {
     /// Voxel by voxel.
     Equal,
+    /// Both against the mesh (in index space) that they were made of, and voxel by voxel where both have one sign: above this
+    /// tolerance in voxels they count as apart.
+    Mesh { mesh: TriangleMesh, tolerance: f64 },
     /// Voxel by voxel where this holds.
     EqualAt(Box<dyn Fn(IVec3) -> bool>),
-    /// Voxel by voxel where both have one sign.
-    SignedAlike,
     /// Both against the distance to the polygonised input, less this offset (in voxels).
     Truth { offset: f64 },
 }
@@ -108,8 +111,10 @@ impl Contest for GridContest<'_> {
         let theirs = theirs.to_level_set()?;
         Ok(match &self.judge {
             Judge::Equal => Difference::between(ours, &theirs, |_, _, _| true),
+            Judge::Mesh { mesh, tolerance } => {
+                Difference::to_mesh(ours, &theirs, &bvh(mesh, &Transform::uniform(1.0)), *tolerance)
+            }
             Judge::EqualAt(counts) => Difference::between(ours, &theirs, |ijk, _, _| counts(ijk)),
-            Judge::SignedAlike => Difference::between(ours, &theirs, |_, a, b| (a < 0.0) == (b < 0.0)),
             Judge::Truth { offset } => {
                 Difference::to_truth(ours, &theirs, self.input.truth()?, self.input.level_set, *offset)
             }

@@ -1,10 +1,14 @@
 //! How far two results lie apart, in voxels.
 
 use glam::{DVec3, IVec3};
+use serde::Serialize;
 
 use crate::grid::{Transform, offset_to_local};
 use crate::levelset::LevelSet;
-use crate::mesh::{Bvh, TriangleMesh};
+use crate::mesh::{Bvh, TriangleMesh, WindingNumber};
+
+/// A look-up of the closest triangle costs more than the operators do: one in so many voxels is asked.
+const EVERY: u32 = 16;
 
 /// Differences of one row.
 #[derive(Clone, Debug, Default)]
@@ -17,6 +21,17 @@ pub(super) struct Difference {
     pub active: u64,
     /// OpenVDB's largest error, where both are held against the truth.
     pub openvdb_max: Option<f64>,
+    /// How the two compare with each other, where both are held against a mesh.
+    pub mutual: Option<Mutual>,
+    /// Of meshes: area and volume of ours over OpenVDB's, less 1.
+    pub area: Option<f64>,
+    pub volume: Option<f64>,
+    /// The same of ours and of OpenVDB's over the mesh that the level set was made from.
+    pub area_to_source: Option<[f64; 2]>,
+    pub volume_to_source: Option<[f64; 2]>,
+    /// Of files: the number of leaves, and the time that copying one to OpenVDB takes.
+    pub leaves: Option<f64>,
+    pub copy_us_a_leaf: Option<f64>,
 }
 
 impl Difference {
@@ -45,6 +60,20 @@ impl Difference {
         difference
     }
 
+    /// Both against the closed mesh that they were made of, given in index space: distances by its closest triangle, signs
+    /// by its winding number. And against each other.
+    pub fn to_mesh(ours: &LevelSet, theirs: &LevelSet, mesh: &Bvh, tolerance: f64) -> Self {
+        let [mut difference, other] = [ours, theirs].map(|result| {
+            let mut difference = Self::default();
+            difference.add_magnitudes(result, mesh);
+            difference
+        });
+        difference.active = active_difference(ours, theirs);
+        difference.openvdb_max = Some(other.max);
+        difference.mutual = Some(Mutual::new(ours, theirs, mesh, tolerance));
+        difference
+    }
+
     /// Takes in one difference, in voxels.
     pub fn add(&mut self, voxels: f64) {
         // A NaN must not pass for a small difference.
@@ -58,20 +87,69 @@ impl Difference {
         (self.sum_of_squares / self.voxels.max(1) as f64).sqrt()
     }
 
+    /// The errors of distances, whatever their sign.
+    fn add_magnitudes(&mut self, result: &LevelSet, mesh: &Bvh) {
+        let reach = f64::from(result.half_width()) + 2.0;
+        let mut count = 0u32;
+        for_each_active(result, |ijk, value| {
+            count += 1;
+            if count.is_multiple_of(EVERY) {
+                let hit = mesh.closest_point(ijk.as_dvec3(), reach);
+                let truth = hit.map_or(f64::INFINITY, |hit| hit.distance_squared.sqrt());
+                self.add(f64::from(value.abs()) / result.voxel_size() - truth);
+            }
+        });
+    }
+
     fn add_errors(&mut self, result: &LevelSet, bvh: &Bvh, source: &LevelSet, offset: f64) {
         let mut field = source.grid().accessor();
         let reach = f64::from(result.half_width()) + offset.abs() + 2.0;
         let mut count = 0u32;
         for_each_active(result, |ijk, value| {
-            // A look-up costs more than the operators do: every 16th voxel is asked.
             count += 1;
-            if count.is_multiple_of(16) {
+            if count.is_multiple_of(EVERY) {
                 let p: DVec3 = ijk.as_dvec3();
                 let d = bvh.closest_point(p, reach).map_or(f64::INFINITY, |hit| hit.distance_squared.sqrt());
                 let signed = if field.value(ijk) < 0.0 { -d } else { d };
                 self.add(f64::from(value) / result.voxel_size() - (signed - offset));
             }
         });
+    }
+}
+
+/// How two conversions of one mesh compare with each other.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Mutual {
+    /// Largest difference where both have one sign, in voxels.
+    pub signed_alike_max_diff_voxels: f64,
+    /// Voxels of one sign in both whose values differ by more than the tolerance.
+    pub signed_alike_above_tolerance: u64,
+    /// Voxels with another sign in each.
+    pub signed_otherwise: u64,
+    /// Voxels of these where the winding number of the mesh contradicts ours.
+    pub missigned_by_ours: u64,
+}
+
+impl Mutual {
+    fn new(ours: &LevelSet, theirs: &LevelSet, mesh: &Bvh, tolerance: f64) -> Self {
+        let mut mutual = Self::default();
+        let winding = WindingNumber::new(mesh);
+        let mut other = theirs.grid().accessor();
+        for_each_active(ours, |ijk, value| {
+            let there = other.value(ijk);
+            if !other.is_active(ijk) {
+                return;
+            }
+            if (value < 0.0) == (there < 0.0) {
+                let difference = f64::from(value - there).abs() / ours.voxel_size();
+                mutual.signed_alike_max_diff_voxels = mutual.signed_alike_max_diff_voxels.max(difference);
+                mutual.signed_alike_above_tolerance += u64::from(difference > tolerance);
+            } else {
+                mutual.signed_otherwise += 1;
+                mutual.missigned_by_ours += u64::from((winding.at(ijk.as_dvec3()) > 0.5) != (value < 0.0));
+            }
+        });
+        mutual
     }
 }
 

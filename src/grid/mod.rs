@@ -8,12 +8,14 @@
 //! origins and does not.
 
 mod accessor;
+mod combine;
 mod leaf;
 mod leaf_set;
 mod page_pool;
 mod paged;
 mod topology;
 mod transform;
+mod volume;
 
 use std::sync::Arc;
 
@@ -21,12 +23,14 @@ use glam::IVec3;
 use rayon::prelude::*;
 
 pub use accessor::Accessor;
+pub use combine::{Combination, SignRule};
 pub use leaf::{Face, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset, leaf_origin, offset_to_local};
 pub use leaf_set::LeafSet;
 pub use paged::{LeafId, PAGE_LEAVES, PageLeaves, Paged};
 use topology::Topology;
 pub use topology::{Neighbours, neighbour_index};
 pub use transform::{Transform, VOXEL_SIZES};
+pub use volume::Volume;
 
 /// Largest index coordinate of a voxel, either sign: beyond it the arithmetic of neighbours could overflow.
 pub const MAX_COORD: i32 = 1 << 30;

@@ -137,6 +137,11 @@ impl<T: Pooled> Paged<T> {
         &mut Self::own(&mut self.pages[id.page()])[id.slot()]
     }
 
+    /// Appends a page of `other`, shared with it.
+    pub(super) fn share_page(&mut self, other: &Self, page: usize) {
+        self.pages.push(other.pages[page].clone());
+    }
+
     /// Whether two arrays share the storage of a leaf's page.
     pub fn shares_page(&self, other: &Self, id: LeafId) -> bool {
         Arc::ptr_eq(&self.pages[id.page()], &other.pages[id.page()])

@@ -10,6 +10,7 @@ use glam::IVec3;
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
+use super::combine::SignRule;
 use super::leaf::LEAF_DIM;
 use super::leaf_set::LeafSet;
 use super::paged::{LeafId, PAGE_LEAVES};
@@ -41,7 +42,7 @@ pub(super) struct Topology {
 }
 
 /// Sort key of origins: x, then y, then z.
-fn key(origin: IVec3) -> (i32, i32, i32) {
+pub(super) fn key(origin: IVec3) -> (i32, i32, i32) {
     (origin.x, origin.y, origin.z)
 }
 
@@ -70,6 +71,37 @@ impl Topology {
         for (&origin, &id) in origins.iter().zip(&topology.order) {
             set_entry(&mut topology.nodes, origin, id);
         }
+        topology
+    }
+
+    /// `leaves` at their slots, sorted by origin, and between them the signs of `parts` as `rule` combines them; `slots` are
+    /// taken in all.
+    pub fn combined(parts: &[&Self], rule: SignRule, leaves: &[(IVec3, LeafId)], slots: usize) -> Self {
+        let mut nodes: Vec<IVec3> = parts.iter().flat_map(|part| part.nodes.keys().copied()).collect();
+        nodes.sort_unstable_by_key(|n| key(*n));
+        nodes.dedup();
+        let mut tables: Vec<Arc<NodeTable>> = nodes.par_iter().map(|node| combined_signs(parts, rule, *node)).collect();
+        let places: FxHashMap<IVec3, usize> = nodes.iter().copied().zip(0..).collect();
+        let mut topology = Self { origins: vec![IVec3::ZERO; slots], ..Self::default() };
+        // Leaves come in runs of one node.
+        let mut last = None;
+        for &(origin, id) in leaves {
+            let node = node_of(origin);
+            let place = match last {
+                Some((n, place)) if n == node => Some(place),
+                _ => places.get(&node).copied(),
+            };
+            last = place.map(|place| (node, place));
+            if let Some(table) = place.and_then(|place| tables.get_mut(place)) {
+                Arc::make_mut(table)[entry_of(origin)] = id;
+            }
+            topology.origins[id.index()] = origin;
+        }
+        topology.order = leaves.iter().map(|(_, id)| *id).collect();
+        topology.live = topology.order.iter().copied().collect();
+        topology.free = (PAGE_LEAVES..slots).rev().map(LeafId::new).filter(|id| !topology.live.contains(*id)).collect();
+        let known = nodes.into_iter().zip(tables).filter(|(_, table)| table.iter().any(|e| *e != LeafId::OUTSIDE));
+        topology.nodes = known.collect();
         topology
     }
 
@@ -328,6 +360,20 @@ fn outside_table() -> Arc<NodeTable> {
     Arc::new([LeafId::OUTSIDE; NODE_ENTRIES])
 }
 
+/// The signs of a node where no part has a leaf; of no meaning elsewhere.
+fn combined_signs(parts: &[&Topology], rule: SignRule, node: IVec3) -> Arc<NodeTable> {
+    let mut won = [false; NODE_ENTRIES];
+    for (part, topology) in parts.iter().enumerate() {
+        let winner = rule.winner(part);
+        match topology.nodes.get(&node) {
+            Some(table) => won.iter_mut().zip(table.iter()).for_each(|(won, entry)| *won |= *entry == winner),
+            None if winner == LeafId::OUTSIDE => won.fill(true),
+            None => {}
+        }
+    }
+    Arc::new(won.map(|won| LeafId::sentinel(won == rule.inside_wins)))
+}
+
 /// Puts `id` into the table at `origin`; returns what was there.
 fn set_entry(nodes: &mut FxHashMap<IVec3, Arc<NodeTable>>, origin: IVec3, id: LeafId) -> LeafId {
     let table = nodes.entry(node_of(origin)).or_insert_with(outside_table);
@@ -361,6 +407,53 @@ pub fn neighbour_index(step: IVec3) -> usize {
 fn neighbour_step(index: usize) -> IVec3 {
     let q = index as i32;
     IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1)
+}
+
+/// Walks the leaves of a topology in order, and knows the sign of other places on the way.
+pub(super) struct Cursor<'a> {
+    topology: &'a Topology,
+    rest: std::slice::Iter<'a, LeafId>,
+    head: Option<(IVec3, LeafId)>,
+    /// The last node asked for.
+    node: Option<(IVec3, Option<&'a NodeTable>)>,
+}
+
+impl<'a> Cursor<'a> {
+    /// A walk over the leaves whose origins have `from` <= x < `to`.
+    pub fn new(topology: &'a Topology, from: i32, to: i32) -> Self {
+        let before = |x: i32| topology.order.partition_point(|id| topology.origin(*id).x < x);
+        let rest = topology.order.get(before(from)..before(to)).unwrap_or_default().iter();
+        let mut cursor = Self { topology, rest, head: None, node: None };
+        cursor.advance();
+        cursor
+    }
+
+    fn advance(&mut self) {
+        self.head = self.rest.next().map(|&id| (self.topology.origin(id), id));
+    }
+
+    /// Where the next leaf is.
+    pub fn origin(&self) -> Option<IVec3> {
+        self.head.map(|(origin, _)| origin)
+    }
+
+    /// The next leaf if it is at `origin`, and steps past it.
+    pub fn take(&mut self, origin: IVec3) -> Option<LeafId> {
+        let (_, id) = self.head.filter(|(at, _)| *at == origin)?;
+        self.advance();
+        Some(id)
+    }
+
+    /// The sign at `origin`, where there is no leaf.
+    pub fn sentinel(&mut self, origin: IVec3) -> LeafId {
+        let node = node_of(origin);
+        let table = match self.node {
+            Some((last, table)) if last == node => table,
+            _ => self.topology.nodes.get(&node).map(|table| &**table),
+        };
+        self.node = Some((node, table));
+        table.map_or(LeafId::OUTSIDE, |table| table[entry_of(origin)])
+    }
 }
 
 /// The tables around the last node asked for: leaves come in runs of one node.

@@ -7,6 +7,7 @@
 //! [`cell_case`](super::marching::cell_case): inside is connected through faces (6 neighbours), outside through faces
 //! and edges (18).
 
+use fearless_simd::{Simd, SimdBase, SimdMask};
 use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 
@@ -17,6 +18,7 @@ use crate::grid::{
     offset_to_local,
 };
 use crate::run::RunOptions;
+use crate::stencil::simd::{Lanes, Work, dispatch};
 
 /// Vertices keep this distance, in voxels, from the ends of their grid edge, so that no two coincide and no triangle
 /// is degenerate where φ = iso at a voxel. Far below the accuracy of linear interpolation; still resolved by f32
@@ -121,19 +123,17 @@ impl SurfaceLeaf {
         (vertices + loops > 0).then_some(Self { id, first_vertex: 0, vertices, triangles, loops, edges, ranks })
     }
 
-    /// The number of the vertex on the edge along `axis` whose first voxel is at `offset`; `None` if it is not crossed.
-    #[inline(always)]
-    fn vertex(&self, axis: usize, offset: usize) -> Option<u32> {
-        let (word, bit) = (offset >> 6, offset & 63);
-        let mask = self.edges[axis].0[word];
-        let before = (mask & ((1 << bit) - 1)).count_ones();
-        (mask >> bit & 1 == 1).then(|| self.first_vertex + u32::from(self.ranks[axis * 8 + word]) + before)
-    }
-
     /// Calls `f` with axis and offset of the first voxel of each crossed edge, in the order of the vertices' numbers.
+    #[inline(always)]
     pub fn for_each_vertex(&self, mut f: impl FnMut(usize, usize)) {
         for (axis, mask) in self.edges.iter().enumerate() {
-            mask.iter().for_each(|offset| f(axis, offset));
+            for (x, &word) in mask.0.iter().enumerate() {
+                let mut rest = word;
+                while rest != 0 {
+                    f(axis, x * 64 + rest.trailing_zeros() as usize);
+                    rest &= rest - 1;
+                }
+            }
         }
     }
 }
@@ -213,17 +213,6 @@ impl<'a> IsoSurface<'a> {
     /// Signs of a leaf and its upper neighbours' first layers.
     pub fn rows(&self, leaf: &SurfaceLeaf) -> SignRows {
         SignRows::gather(&self.signs, &self.grid.neighbours()[leaf.id.index()])
-    }
-
-    /// Finds the vertices of the cells of a leaf.
-    pub fn cell_vertices(&self, leaf: &SurfaceLeaf) -> CellVertices<'_> {
-        let around = &self.grid.neighbours()[leaf.id.index()];
-        CellVertices {
-            upper: std::array::from_fn(|c| {
-                let id = around[neighbour_index(corner(c))];
-                self.leaves.get(self.places[id.index()] as usize)
-            }),
-        }
     }
 
     /// Calls `f` with the index-space position of each vertex of a leaf, in the order of their numbers.
@@ -316,12 +305,12 @@ impl<'a> IsoSurface<'a> {
     /// Whether a vertex lies on a grid edge of an absent leaf: space of both signs meets there without a leaf between, and the
     /// surface cannot be followed. Never on a valid level set.
     pub fn is_torn(&self) -> bool {
-        let torn = |leaf: &SurfaceLeaf| {
+        let torn = |vertices: &mut CellVertices, leaf: &SurfaceLeaf| {
             let around = &self.grid.neighbours()[leaf.id.index()];
             if (1..8).all(|c| !around[neighbour_index(corner(c))].is_sentinel()) {
                 return false;
             }
-            let vertices = self.cell_vertices(leaf);
+            vertices.take(self, leaf);
             let mut torn = false;
             self.rows(leaf).for_each_cell(|cell, pattern| {
                 let crossed = cell_case(pattern).crossed;
@@ -329,7 +318,7 @@ impl<'a> IsoSurface<'a> {
             });
             torn
         };
-        self.leaves.par_iter().with_min_len(16).any(torn)
+        self.leaves.par_iter().with_min_len(16).map_init(CellVertices::new, torn).any(|torn| torn)
     }
 
     /// A voxel of this leaf whose sign differs from that of the absent leaf next to it: the surface leaves the stored
@@ -386,23 +375,82 @@ const BLOCKS: [IVec3; 64] = {
     blocks
 };
 
-/// The leaves that hold the vertices of a leaf's cells.
-pub(crate) struct CellVertices<'a> {
-    /// The leaf and its seven upper neighbours by corner, where the surface crosses them.
-    upper: [Option<&'a SurfaceLeaf>; 8],
+/// The numbers of the vertices on the edges of a leaf's cells, by edge: made for one leaf after the other, so that cells
+/// look up nothing but this table.
+pub(crate) struct CellVertices {
+    /// Edges along x, y, z, each by its first voxel: 9³ of them, as cells reach into the upper neighbours.
+    numbers: Box<[u32; 3 * CORNERS]>,
+    /// The entries in use.
+    used: Vec<u16>,
 }
 
-impl CellVertices<'_> {
+/// Corners of a leaf's cells.
+const CORNERS: usize = 9 * 9 * 9;
+
+/// Stands for no vertex.
+const NO_VERTEX: u32 = u32::MAX;
+
+/// The voxels of a word of a mask with y = 0, and with z = 0.
+const Y_FIRST: u64 = 0xff;
+const Z_FIRST: u64 = 0x0101_0101_0101_0101;
+
+/// Where the entry of an edge lies from that of its cell's first corner.
+const EDGE_STEPS: [usize; 12] = {
+    let mut steps = [0; 12];
+    let mut e = 0;
+    while e < 12 {
+        let (axis, first) = (EDGES[e].0, EDGES[e].1 as usize);
+        steps[e] = axis * CORNERS + (first >> 2) * 81 + (first >> 1 & 1) * 9 + (first & 1);
+        e += 1;
+    }
+    steps
+};
+
+impl CellVertices {
+    pub fn new() -> Self {
+        Self { numbers: Box::new([NO_VERTEX; 3 * CORNERS]), used: Vec::new() }
+    }
+
+    /// Makes the table of `leaf`.
+    pub fn take(&mut self, surface: &IsoSurface, leaf: &SurfaceLeaf) {
+        self.used.drain(..).for_each(|entry| self.numbers[usize::from(entry)] = NO_VERTEX);
+        let around = &surface.grid.neighbours()[leaf.id.index()];
+        for c in 0..7 {
+            let Some(place) = surface.place(around[neighbour_index(corner(c))]) else { continue };
+            let Some(leaf) = surface.leaves.get(place) else { continue };
+            // Of an upper neighbour, its lowest layer along the axes on which it lies above.
+            let (slices, rows) = (if c & 4 == 0 { 8 } else { 1 }, if c & 2 == 0 { u64::MAX } else { Y_FIRST });
+            let wanted = rows & if c & 1 == 0 { u64::MAX } else { Z_FIRST };
+            let base = (c >> 2) * 8 * 81 + (c >> 1 & 1) * 8 * 9 + (c & 1) * 8;
+            for axis in (0..3).filter(|axis| c >> (2 - axis) & 1 == 0) {
+                for x in 0..slices {
+                    let word = leaf.edges[axis].0[x];
+                    let first = leaf.first_vertex + u32::from(leaf.ranks[axis * 8 + x]);
+                    let mut rest = word & wanted;
+                    let mut next = first;
+                    while rest != 0 {
+                        let bit = rest.trailing_zeros() as usize;
+                        if wanted != u64::MAX {
+                            next = first + (word & ((1 << bit) - 1)).count_ones();
+                        }
+                        let entry = axis * CORNERS + base + x * 81 + (bit >> 3) * 9 + (bit & 7);
+                        self.numbers[entry] = next;
+                        self.used.push(entry as u16);
+                        next += 1;
+                        rest &= rest - 1;
+                    }
+                }
+            }
+        }
+    }
+
     /// Number of the vertex on an edge of the cell with first corner `cell`; `None` if the edge belongs to an absent
     /// leaf.
     #[inline(always)]
     pub fn vertex(&self, cell: IVec3, edge: u8) -> Option<u32> {
-        let (axis, first) = EDGES[usize::from(edge)];
-        let voxel = cell + corner(usize::from(first));
-        let beyond: IVec3 = voxel >> 3;
-        let local: IVec3 = voxel & 7;
-        let leaf = self.upper[(beyond.x * 4 + beyond.y * 2 + beyond.z) as usize]?;
-        leaf.vertex(axis, (local.x * 64 + local.y * 8 + local.z) as usize)
+        let first = (cell.x * 81 + cell.y * 9 + cell.z) as usize;
+        let number = self.numbers[first + EDGE_STEPS[usize::from(edge)]];
+        (number != NO_VERTEX).then_some(number)
     }
 }
 
@@ -411,12 +459,26 @@ pub(crate) fn corner(c: usize) -> IVec3 {
     IVec3::new((c >> 2) as i32, (c >> 1 & 1) as i32, (c & 1) as i32)
 }
 
+/// The voxels with φ < iso.
 fn inside_mask(values: &LeafValues, iso: f32) -> LeafMask {
-    LeafMask(std::array::from_fn(|x| {
-        let mut word = 0;
-        for (bit, value) in values.0[x * 64..(x + 1) * 64].iter().enumerate() {
-            word |= u64::from(*value < iso) << bit;
+    let mut mask = LeafMask::EMPTY;
+    dispatch(Inside { values, iso, mask: &mut mask });
+    mask
+}
+
+struct Inside<'a> {
+    values: &'a LeafValues,
+    iso: f32,
+    mask: &'a mut LeafMask,
+}
+
+impl Work for Inside<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let iso = Lanes::splat(simd, self.iso);
+        for (pair, values) in self.values.0.as_chunks::<16>().0.iter().enumerate() {
+            let inside = Lanes::from_slice(simd, values).simd_lt(iso).to_bitmask();
+            self.mask.0[pair / 4] |= inside << (16 * (pair % 4));
         }
-        word
-    }))
+    }
 }

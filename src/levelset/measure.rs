@@ -19,7 +19,7 @@ use serde::Serialize;
 
 use super::LevelSet;
 use super::components;
-use super::isosurface::{IsoSurface, MEMORY_ADVICE, SurfaceLeaf, corner, crossing};
+use super::isosurface::{CellVertices, IsoSurface, MEMORY_ADVICE, SurfaceLeaf, corner, crossing};
 use super::marching::{EDGES, MAX_TRIANGLES, across, cell_case};
 use super::union_find::UnionFind;
 use crate::error::Result;
@@ -163,8 +163,8 @@ impl Points {
 
 fn surface_components(surface: &IsoSurface) -> u64 {
     let sets = UnionFind::new(surface.vertex_count());
-    surface.leaves().par_iter().with_min_len(16).for_each(|leaf| {
-        let vertices = surface.cell_vertices(leaf);
+    surface.leaves().par_iter().with_min_len(16).for_each_init(CellVertices::new, |vertices, leaf| {
+        vertices.take(surface, leaf);
         surface.rows(leaf).for_each_cell(|cell, pattern| {
             for &[a, b, c] in &cell_case(pattern).triangles {
                 let first = vertices.vertex(cell, a);

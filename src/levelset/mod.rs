@@ -7,6 +7,7 @@ mod build;
 mod check;
 mod components;
 mod curvature;
+mod curve;
 pub(crate) mod dual;
 mod field;
 pub(crate) mod isosurface;

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::TriangleMesh;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
-use crate::levelset::isosurface::{IsoSurface, MEMORY_ADVICE, SurfaceLeaf};
+use crate::levelset::isosurface::{CellVertices, IsoSurface, MEMORY_ADVICE, SurfaceLeaf};
 use crate::levelset::marching::cell_case;
 use crate::run::RunOptions;
 
@@ -37,7 +37,7 @@ pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Re
     let complete = split(leaves, &mut positions, &mut triangles)
         .into_par_iter()
         .with_min_len(16)
-        .map(|(leaf, positions, triangles)| {
+        .map_init(CellVertices::new, |vertices, (leaf, positions, triangles)| {
             if run.is_cancelled() {
                 return true;
             }
@@ -48,7 +48,8 @@ pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Re
                 }
             });
             task.advance(1);
-            fill_triangles(&surface, leaf, mirrored, triangles)
+            vertices.take(&surface, leaf);
+            fill_triangles(&surface, leaf, vertices, mirrored, triangles)
         })
         .all(|complete| complete);
     run.check(OPERATION)?;
@@ -109,8 +110,13 @@ fn split<'a>(
 }
 
 /// Whether all vertices were found: the edges of a valid level set all lie in stored leaves.
-fn fill_triangles(surface: &IsoSurface, leaf: &SurfaceLeaf, mirrored: bool, triangles: &mut [[u32; 3]]) -> bool {
-    let vertices = surface.cell_vertices(leaf);
+fn fill_triangles(
+    surface: &IsoSurface,
+    leaf: &SurfaceLeaf,
+    vertices: &CellVertices,
+    mirrored: bool,
+    triangles: &mut [[u32; 3]],
+) -> bool {
     let mut slots = triangles.iter_mut();
     let mut complete = true;
     surface.rows(leaf).for_each_cell(|cell, pattern| {

@@ -2,6 +2,7 @@
 
 mod attributes;
 mod bezier;
+mod bins;
 mod bvh;
 mod closest;
 mod cluster;

@@ -11,7 +11,9 @@ use glam::DVec3;
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::topology::{DisjointSets, EdgeUse, by_edge, edge_uses, is_degenerate, sorted, volume_about};
+use super::topology::{
+    DisjointSets, EdgeUse, analyze_edges, by_edge, edge_uses, is_degenerate, sorted_triangles, volume_about,
+};
 use super::winding::solid_angle;
 use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber, analyze};
 
@@ -26,10 +28,13 @@ pub fn prepare(mesh: &TriangleMesh) -> (TriangleMesh, MeshFindings) {
     let mut clean =
         TriangleMesh { positions: mesh.positions.clone(), triangles: mesh.triangles.clone(), ..Default::default() };
     findings.welded_equal = weld_equal(&mut clean);
-    findings.found = analyze(&clean);
-    findings.degenerate_dropped += drop_degenerate(&mut clean);
-    resolve_duplicates(&mut clean, &mut findings);
     let mut uses = edge_uses(&clean.triangles);
+    findings.found = analyze_edges(&clean, &uses);
+    if findings.found.degenerate_triangles + findings.found.duplicate_triangles > 0 {
+        findings.degenerate_dropped += drop_degenerate(&mut clean);
+        resolve_duplicates(&mut clean, &mut findings);
+        uses = edge_uses(&clean.triangles);
+    }
     if by_edge(&uses).any(|edge| edge.len() == 1) {
         findings.welded_near = weld_cracks(&mut clean, &uses);
         if findings.welded_near > 0 {
@@ -40,7 +45,9 @@ pub fn prepare(mesh: &TriangleMesh) -> (TriangleMesh, MeshFindings) {
     }
     let patches = Patches::new(&mut clean, &uses, &mut findings);
     orient_outwards(&mut clean, &patches, &mut findings);
-    findings.converted = analyze(&clean);
+    let changes = findings.degenerate_dropped + findings.duplicates_dropped + findings.cancelled + findings.welded_near;
+    let turned = findings.inside_out || findings.reoriented + findings.flipped_parts > 0;
+    findings.converted = if changes == 0 && !turned { findings.found.clone() } else { analyze(&clean) };
     findings.converted.unreferenced_vertices = 0;
     (clean, findings)
 }
@@ -112,8 +119,7 @@ fn retain(mesh: &mut TriangleMesh, keep: &[bool]) -> usize {
 /// Back to back means wound oppositely, and not needed: where the surface around misses exactly one triangle the first is
 /// kept whatever the winding, because in a mesh of random orientation the winding says nothing.
 fn resolve_duplicates(mesh: &mut TriangleMesh, findings: &mut MeshFindings) {
-    let mut order: Vec<([u32; 3], u32)> = (0u32..).zip(&mesh.triangles).map(|(t, &v)| (sorted(v), t)).collect();
-    order.sort_unstable();
+    let order = sorted_triangles(&mesh.triangles);
     if order.windows(2).all(|w| w[0].0 != w[1].0) {
         return;
     }

@@ -233,10 +233,10 @@ mod tests {
     #[test]
     fn offsets_are_exact_on_both_sides() {
         for offset in [1.0, -1.0, 2.5, -4.0, 9.0, -9.5, 17.0, 40.0] {
-            check(&parts(), moved(3.0, offset), 1 + offset.abs() as usize / 4);
+            check(&parts(), moved(3.0, offset), 2 + offset.abs() as usize / 3);
         }
         for offset in [-2.0, -11.0, 40.0, 70.0] {
-            check(&ball(DVec3::new(0.3, -0.2, 0.1), 12.0), moved(1.5, offset), 1 + offset.abs() as usize / 4);
+            check(&ball(DVec3::new(0.3, -0.2, 0.1), 12.0), moved(1.5, offset), 2 + offset.abs() as usize / 3);
         }
         assert!(rebuild(&parts(), &moved(3.0, -20.0), &RunOptions::default()).unwrap().is_empty());
     }

@@ -30,17 +30,45 @@ impl EdgeUse {
 
 /// All uses of edges by triangles, grouped by edge: sorted by edge, then triangle. Collapsed edges are left out.
 pub(crate) fn edge_uses(triangles: &[[u32; 3]]) -> Vec<EdgeUse> {
-    let mut uses = Vec::with_capacity(triangles.len() * 3);
-    for (t, &[a, b, c]) in triangles.iter().enumerate() {
-        for (from, to) in [(a, b), (b, c), (c, a)] {
-            if from != to {
-                let key = (from.min(to) as u64) << 32 | from.max(to) as u64;
-                uses.push(EdgeUse { key, triangle: t as u32, forward: from < to });
-            }
-        }
+    let uses = |t: usize| {
+        let [a, b, c] = triangles[t];
+        [(a, b), (b, c), (c, a)].into_iter().filter(|(from, to)| from != to).map(move |(from, to)| {
+            let key = (from.min(to) as u64) << 32 | from.max(to) as u64;
+            EdgeUse { key, triangle: t as u32, forward: from < to }
+        })
+    };
+    sort_by_vertex(triangles, uses, |u| (u.key >> 32) as u32)
+}
+
+/// The vertices of each triangle in ascending order, and the triangle: sorted, so that duplicates follow each other.
+pub(crate) fn sorted_triangles(triangles: &[[u32; 3]]) -> Vec<([u32; 3], u32)> {
+    sort_by_vertex(triangles, |t| [(sorted(triangles[t]), t as u32)].into_iter(), |&(v, _)| v[0])
+}
+
+/// What `items` gives for every triangle, sorted. `vertex`, by which the items must be sorted first, is one of the triangle's: the few
+/// items of each vertex are gathered by counting, so that only they are compared.
+fn sort_by_vertex<T: Copy + Ord + Send, I: Iterator<Item = T>>(
+    triangles: &[[u32; 3]],
+    items: impl Fn(usize) -> I,
+    vertex: impl Fn(&T) -> u32 + Sync,
+) -> Vec<T> {
+    let vertices = triangles.iter().flatten().max().map_or(0, |&v| v as usize + 1);
+    let mut next = vec![0usize; vertices + 1];
+    for item in (0..triangles.len()).flat_map(&items) {
+        next[vertex(&item) as usize + 1] += 1;
     }
-    uses.par_sort_unstable();
-    uses
+    for v in 0..vertices {
+        next[v + 1] += next[v];
+    }
+    let Some(any) = (0..triangles.len()).flat_map(&items).next() else { return Vec::new() };
+    let mut sorted = vec![any; next[vertices]];
+    for item in (0..triangles.len()).flat_map(&items) {
+        let at = &mut next[vertex(&item) as usize];
+        sorted[*at] = item;
+        *at += 1;
+    }
+    sorted.par_chunk_by_mut(|a, b| vertex(a) == vertex(b)).for_each(<[T]>::sort_unstable);
+    sorted
 }
 
 /// The uses of one edge after the other.
@@ -108,11 +136,15 @@ pub struct Topology {
 
 /// Examines `mesh`, whose indices must be in range.
 pub fn analyze(mesh: &TriangleMesh) -> Topology {
-    let uses = edge_uses(&mesh.triangles);
+    analyze_edges(mesh, &edge_uses(&mesh.triangles))
+}
+
+/// [`analyze`], given the mesh's edge uses.
+pub(crate) fn analyze_edges(mesh: &TriangleMesh, uses: &[EdgeUse]) -> Topology {
     let mut topology = Topology { signed_volume: signed_volume(mesh), ..Topology::default() };
     let mut sets = DisjointSets::new(mesh.triangles.len());
     let mut edges = 0;
-    for edge in by_edge(&uses) {
+    for edge in by_edge(uses) {
         edges += 1;
         match edge {
             [_] => topology.boundary_edges += 1,
@@ -133,9 +165,8 @@ pub fn analyze(mesh: &TriangleMesh) -> Topology {
     topology.unreferenced_vertices = mesh.positions.len() - used;
     topology.euler_characteristic = used as i64 - edges + mesh.triangles.len() as i64;
 
-    let mut keys: Vec<[u32; 3]> = mesh.triangles.iter().map(|&t| sorted(t)).collect();
-    keys.par_sort_unstable();
-    topology.duplicate_triangles = keys.windows(2).filter(|w| w[0] == w[1]).count();
+    let keys = sorted_triangles(&mesh.triangles);
+    topology.duplicate_triangles = keys.windows(2).filter(|w| w[0].0 == w[1].0).count();
     topology.degenerate_triangles = (0..mesh.triangles.len()).filter(|&t| is_degenerate(mesh, t)).count();
     topology
 }

@@ -4,21 +4,21 @@
 //! voxel being that of the operand it comes from; a tie is the first operand's. Nothing is renormalised: the result is
 //! an exact distance outside a union and inside an intersection, elsewhere at most the distance. `rebuild` makes it exact.
 //!
-//! The result begins as a copy of the first operand that shares its pages; only leaves that both have, and those that
-//! come from the second alone, are written.
+//! Only leaves that several operands have, and the leaves of what is cut away, are written; all others are shared with
+//! their operand.
 
-use glam::IVec3;
-use rustc_hash::FxHashMap;
+use fearless_simd::{Select, Simd, SimdBase, SimdMask};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::params::words;
 use super::registry::{Arity, Operator, Outcome, Summary};
 use crate::error::Result;
-use crate::grid::{Grid, LEAF_VOXELS, LeafId, LeafMask, LeafSet, LeafValues};
+use crate::grid::{Combination, Grid, LeafMask, LeafValues, SignRule};
 use crate::levelset::{LevelSet, background};
 use crate::mesh::{Rebuild, onto_lattice, rebuild, with_half_width};
 use crate::run::RunOptions;
+use crate::stencil::simd::{Lanes, Work, dispatch};
 
 words! {
     /// A constructive operation.
@@ -58,14 +58,9 @@ impl Operator for Csg {
 
     fn apply(&self, inputs: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
         let (aligned, warnings) = align(inputs, run)?;
-        let task = run.task("combining", aligned.len() as u64 - 1);
-        let mut parts = aligned.into_iter();
-        let mut result = parts.next().unwrap_or_else(|| unreachable!("the registry counts the inputs"));
-        for part in parts {
-            run.check(Self::NAME)?;
-            result = csg(&result, &part, self.operation);
-            task.advance(1);
-        }
+        let Some((first, others)) = aligned.split_first() else { unreachable!("the registry counts the inputs") };
+        let others: Vec<&LevelSet> = others.iter().collect();
+        let mut result = csg(first, &others, self.operation, run)?;
         if self.rebuild {
             result = rebuild(&result, &Rebuild::band(result.half_width()), run)?;
         }
@@ -111,73 +106,48 @@ pub fn align(mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<(Vec<LevelSe
     Ok((inputs, warnings))
 }
 
-/// One operation on two level sets of the same lattice and half width.
-pub fn csg(a: &LevelSet, b: &LevelSet, operation: CsgOperation) -> LevelSet {
-    LevelSet::new(combine(a.grid(), b.grid(), operation), *a.transform())
+/// One operation on level sets of the same lattice and half width, all at once: no grid between two of them is made.
+///
+/// The result shares the pages of leaves that one of them alone decides.
+pub fn csg(first: &LevelSet, others: &[&LevelSet], operation: CsgOperation, run: &RunOptions) -> Result<LevelSet> {
+    let parts: Vec<&Grid> = std::iter::once(first).chain(others.iter().copied()).map(LevelSet::grid).collect();
+    let union = operation == CsgOperation::Union;
+    let rule = SignRule { inside_wins: union, complement_others: operation == CsgOperation::Difference };
+    let combination = Combination::new(&parts, rule);
+    run.reserve(Csg::NAME, combination.bytes(), "resample to a larger voxel size or raise the memory limit")?;
+    run.check(Csg::NAME)?;
+    let merged = combination.make(|a, a_mask, b, b_mask, factor| {
+        dispatch(Merge { a, a_mask, b, b_mask, factor, union });
+    });
+    Ok(LevelSet::new(merged, *first.transform()))
 }
 
-fn combine(a: &Grid, b: &Grid, operation: CsgOperation) -> Grid {
-    // The sign of the second operand's space that wins over whatever the first one has, and the one that leaves it alone.
-    let (union, negate) = match operation {
-        CsgOperation::Union => (true, false),
-        CsgOperation::Intersection => (false, false),
-        CsgOperation::Difference => (false, true),
-    };
-    let inside = |id: LeafId| (id == LeafId::INSIDE) != negate;
-    let wins = |inside: bool| inside == union;
-
-    let mut out = a.clone();
-    let swallowed: Vec<LeafId> = a
-        .leaves()
-        .iter()
-        .copied()
-        .filter(|&id| {
-            let there = b.find(a.origin(id));
-            there.is_sentinel() && wins(inside(there))
-        })
-        .collect();
-    out.remove_leaves(&swallowed, union);
-
-    let mut both = LeafSet::default();
-    // The leaves that come from the second operand alone: where they go, and which they are.
-    let (mut places, mut sources): (Vec<IVec3>, Vec<LeafId>) = Default::default();
-    for &id in b.leaves() {
-        let here = a.find(b.origin(id));
-        if !here.is_sentinel() {
-            both.insert(here);
-        } else if !wins(here == LeafId::INSIDE) {
-            places.push(b.origin(id));
-            sources.push(id);
-        }
-    }
-    let copied: FxHashMap<LeafId, LeafId> = out.add_leaves(&places).into_iter().zip(sources).collect();
-    let added: LeafSet = copied.keys().copied().collect();
-    let sign = if negate { -1.0 } else { 1.0 };
-    out.update(&both, |id, values, mask| {
-        let other = b.find(a.origin(id));
-        merge_leaf(values, mask, b.values(other), b.mask(other), sign, union);
-    });
-    out.update(&added, |id, values, mask| {
-        let source = copied[&id];
-        *mask = b.mask(source);
-        for (v, s) in values.0.iter_mut().zip(&b.values(source).0) {
-            *v = sign * s;
-        }
-    });
-    out.combine_signs(b, |mine, theirs| if union { mine || theirs != negate } else { mine && theirs != negate });
-    out.prune(&both);
-    out
+/// a ← min(a, factor · b) for a union, else the maximum; each voxel with the state of the operand it comes from, a tie with that
+/// of a.
+struct Merge<'a> {
+    a: &'a mut LeafValues,
+    a_mask: &'a mut LeafMask,
+    b: &'a LeafValues,
+    b_mask: LeafMask,
+    factor: f32,
+    union: bool,
 }
 
-/// The minimum or maximum of two leaves, each voxel with the state of the operand it comes from.
-#[inline(always)]
-fn merge_leaf(a: &mut LeafValues, mask: &mut LeafMask, b: &LeafValues, b_mask: LeafMask, sign: f32, union: bool) {
-    let mut from_b = LeafMask::EMPTY;
-    for offset in 0..LEAF_VOXELS {
-        let other = sign * b.0[offset];
-        let take = if union { a.0[offset] > other } else { a.0[offset] < other };
-        a.0[offset] = if take { other } else { a.0[offset] };
-        from_b.0[offset >> 6] |= u64::from(take) << (offset & 63);
+impl Work for Merge<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let factor = Lanes::splat(simd, self.factor);
+        for x in 0..8 {
+            let mut from_b = 0;
+            for pair in 0..4 {
+                let at = 64 * x + 16 * pair;
+                let a = Lanes::from_slice(simd, &self.a.0[at..at + 16]);
+                let b = Lanes::from_slice(simd, &self.b.0[at..at + 16]) * factor;
+                let take = if self.union { a.simd_gt(b) } else { a.simd_lt(b) };
+                take.select(b, a).store_slice(&mut self.a.0[at..at + 16]);
+                from_b |= take.to_bitmask() << (16 * pair);
+            }
+            self.a_mask.0[x] = (self.a_mask.0[x] & !from_b) | (self.b_mask.0[x] & from_b);
+        }
     }
-    *mask = LeafMask(std::array::from_fn(|x| (mask.0[x] & !from_b.0[x]) | (b_mask.0[x] & from_b.0[x])));
 }

@@ -5,16 +5,18 @@
 //! twice the distance are filled. Between the two the distance is rebuilt, or the second would undo the first.
 //!
 //! Each step is one rebuild ([`crate::mesh::rebuild`]): exact distances to the polygonised surface, at any distance,
-//! no stepping. Eroding everything away leaves an empty level set, which is legal.
+//! no stepping; `offset --like openvdb` takes steps, to compare. Eroding everything away leaves an empty level set, which is legal.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::params::WorldLength;
 use super::registry::{Arity, Operator, Outcome, Summary};
+use super::solver::{Like, evolved};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{Rebuild, rebuild};
+use crate::pde::{self, SolverOptions};
 use crate::run::RunOptions;
 
 /// Moves the surface by `distance` (world units, positive outwards); the band keeps its half width.
@@ -22,9 +24,80 @@ pub fn offset(level_set: &LevelSet, distance: f64, run: &RunOptions) -> Result<L
     rebuild(level_set, &Rebuild { offset: distance, ..Rebuild::band(level_set.half_width()) }, run)
 }
 
+/// Refuses a length that cannot be moved by.
+fn validate(operation: &str, distance: WorldLength, least: f64) -> Result<()> {
+    let value = distance.world(1.0);
+    if value.is_finite() && value >= least {
+        return Ok(());
+    }
+    let accepted = if least == 0.0 { "a length of 0 or more, such as 0.1 or 3vx" } else { "a finite length" };
+    Err(EditError::parameter(operation, "distance", distance, accepted))
+}
+
+/// Moves the surface by the distance times each of `signs` in turn.
+fn moved(
+    operation: &str,
+    inputs: Vec<LevelSet>,
+    distance: WorldLength,
+    signs: &[f64],
+    run: &RunOptions,
+) -> Result<Outcome> {
+    let mut summary = Summary::default();
+    let mut result = inputs.into_iter().next().unwrap_or_else(|| unreachable!("the registry counts the inputs"));
+    let length = distance.world(result.voxel_size());
+    let was_empty = result.is_empty();
+    for sign in signs {
+        run.check(operation)?;
+        result = offset(&result, sign * length, run)?;
+    }
+    if result.is_empty() && !was_empty {
+        let warning = format!("nothing is left: every part is thinner than twice the distance {distance}");
+        summary.warnings.push(warning);
+    }
+    Ok(Outcome { level_set: result, summary })
+}
+
+/// Move the surface by an exact distance, outwards if positive.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct Offset {
+    /// How far the surface moves.
+    pub distance: WorldLength,
+    /// Move it as another tool does, to compare results one to one: `openvdb` takes steps of half a voxel and tracks the band after
+    /// each, which is not exact.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub like: Option<Like>,
+}
+
+impl Default for Offset {
+    /// One voxel.
+    fn default() -> Self {
+        Self { distance: WorldLength::voxel(), like: None }
+    }
+}
+
+impl Operator for Offset {
+    const NAME: &'static str = "offset";
+    const ARITY: Arity = Arity::One;
+
+    fn validate(&self) -> Result<()> {
+        validate(Self::NAME, self.distance, f64::NEG_INFINITY)
+    }
+
+    fn apply(&self, mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
+        match self.like {
+            None => moved(Self::NAME, inputs, self.distance, &[1.0], run),
+            Some(Like::OpenVdb) => evolved(inputs.remove(0), run, |level_set| {
+                let distance = self.distance.world(level_set.voxel_size());
+                pde::offset(level_set, distance, None, &SolverOptions::OPENVDB, run)
+            }),
+        }
+    }
+}
+
 /// An operator that moves the surface by its distance times each of `signs` in turn.
 macro_rules! morphology {
-    ($(#[$doc:meta])* $name:ident, $text:literal, $signs:expr, $least:expr) => {
+    ($(#[$doc:meta])* $name:ident, $text:literal, $signs:expr) => {
         $(#[$doc])*
         #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
         #[serde(default)]
@@ -45,67 +118,39 @@ macro_rules! morphology {
             const ARITY: Arity = Arity::One;
 
             fn validate(&self) -> Result<()> {
-                let value = self.distance.world(1.0);
-                let least: f64 = $least;
-                if value.is_finite() && value >= least {
-                    return Ok(());
-                }
-                let accepted = if least == 0.0 { "a length of 0 or more, such as 0.1 or 3vx" } else { "a finite length" };
-                Err(EditError::parameter(Self::NAME, "distance", self.distance, accepted))
+                validate(Self::NAME, self.distance, 0.0)
             }
 
             fn apply(&self, inputs: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
-                let mut summary = Summary::default();
-                let mut result = inputs.into_iter().next().unwrap_or_else(|| unreachable!("the registry counts the inputs"));
-                let distance = self.distance.world(result.voxel_size());
-                let was_empty = result.is_empty();
-                for sign in $signs {
-                    run.check(Self::NAME)?;
-                    result = offset(&result, sign * distance, run)?;
-                }
-                if result.is_empty() && !was_empty {
-                    summary.warnings.push(format!("nothing is left: every part is thinner than twice the distance {}", self.distance));
-                }
-                Ok(Outcome { level_set: result, summary })
+                moved(Self::NAME, inputs, self.distance, &$signs, run)
             }
         }
     };
 }
 
 morphology!(
-    /// Move the surface by an exact distance, outwards if positive.
-    Offset,
-    "offset",
-    [1.0],
-    f64::NEG_INFINITY
-);
-morphology!(
     /// Move the surface outwards by an exact distance.
     Dilate,
     "dilate",
-    [1.0],
-    0.0
+    [1.0]
 );
 morphology!(
     /// Move the surface inwards by an exact distance.
     Erode,
     "erode",
-    [-1.0],
-    0.0
+    [-1.0]
 );
 morphology!(
     /// Remove what is thinner than twice the distance: erode, then dilate.
     Open,
     "open",
-    [-1.0, 1.0],
-    0.0
+    [-1.0, 1.0]
 );
 morphology!(
     /// Fill gaps narrower than twice the distance: dilate, then erode.
     Close,
     "close",
-    [1.0, -1.0],
-    0.0
+    [1.0, -1.0]
 );
 
 #[cfg(test)]
@@ -203,8 +248,8 @@ mod tests {
     #[test]
     fn negative_distances_are_for_offset_only() {
         let distance = WorldLength::new(-1.0);
-        assert!(Offset { distance }.validate().is_ok());
+        assert!(Offset { distance, like: None }.validate().is_ok());
         assert!(Dilate { distance }.validate().is_err() && Open { distance }.validate().is_err());
-        assert!(Offset { distance: WorldLength::new(f64::NAN) }.validate().is_err());
+        assert!(Offset { distance: WorldLength::new(f64::NAN), like: None }.validate().is_err());
     }
 }

@@ -4,6 +4,8 @@
 //! falls as fast as it can, a sphere of radius R shrinks as R² − 2t. Central |∇φ|, explicit steps of h²/3.
 //! `laplacian` diffuses the field, φ_t = Δφ, in steps of h²/6: the mean of the six neighbours. On a distance field it is
 //! the same motion twice as fast (Δφ = κ₁ + κ₂); near creases it mixes in the field beyond the medial axis.
+//! `mean`, `gaussian` and `median` filter the field over boxes of (2·width + 1)³ voxels ([`filter`](crate::stencil::filter)):
+//! a mean moves a sphere of radius R by w(w + 1)/(3R) voxels, a Gaussian is four means. They are applied once if `iterations` is not given.
 //!
 //! Degenerate cases: where the gradient vanishes the curvature counts as 0. Parts thinner than the band shrink and vanish.
 //!
@@ -15,12 +17,11 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::params::words;
-use super::registry::{Arity, Operator, Outcome, Summary};
-use super::solver::EvolutionOptions;
-use crate::error::Result;
-use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
-use crate::mesh::with_half_width;
-use crate::pde::{Report, SolverOptions, SpeedFunction, UpwindScheme, evolve};
+use super::registry::{Arity, Operator, Outcome};
+use super::solver::{EvolutionOptions, evolved};
+use crate::error::{EditError, Result};
+use crate::levelset::LevelSet;
+use crate::pde::{Filter, FilterKind, Report, SolverOptions, SpeedFunction, UpwindScheme, evolve, filter};
 use crate::run::RunOptions;
 use crate::stencil::curvature::{laplacian, mean_curvature};
 use crate::stencil::simd::Lanes;
@@ -33,6 +34,12 @@ words! {
         Curvature = "curvature",
         /// Diffusion of the distance field.
         Laplacian = "laplacian",
+        /// Four means.
+        Gaussian = "gaussian",
+        /// Mean over a box of the distance field.
+        Mean = "mean",
+        /// Median over a box of the distance field.
+        Median = "median",
     }
 }
 
@@ -40,8 +47,12 @@ words! {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Smooth {
-    /// How: `curvature` moves the surface by its mean curvature (steps of h²/3), `laplacian` diffuses the field (h²/6).
+    /// How: `curvature` moves the surface by its mean curvature (steps of h²/3), `laplacian` diffuses the field (h²/6);
+    /// `mean` averages it over a box, `gaussian` four times, `median` takes the middle value, and spares sharp edges.
     pub method: SmoothMethod,
+    /// Width of the box of `gaussian`, `mean` and `median` in voxels to each side; 1 if not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub width: Option<u32>,
     #[serde(flatten)]
     #[allow(missing_docs)]
     pub evolution: EvolutionOptions,
@@ -49,7 +60,7 @@ pub struct Smooth {
 
 impl Default for Smooth {
     fn default() -> Self {
-        Self { method: SmoothMethod::Curvature, evolution: EvolutionOptions::default() }
+        Self { method: SmoothMethod::Curvature, width: None, evolution: EvolutionOptions::default() }
     }
 }
 
@@ -61,43 +72,55 @@ impl Operator for Smooth {
     const ARITY: Arity = Arity::One;
 
     fn validate(&self) -> Result<()> {
-        self.evolution.validate(Self::NAME)
+        self.evolution.validate(Self::NAME)?;
+        if let Some(filter) = self.filter() {
+            if let Some(time) = self.evolution.time {
+                return Err(EditError::parameter(
+                    Self::NAME,
+                    "time",
+                    time,
+                    "`iterations` instead: a filter has no time",
+                ));
+            }
+            return filter.validate(Self::NAME);
+        }
+        match self.width {
+            Some(width) => {
+                Err(EditError::parameter(Self::NAME, "width", width, "only with the methods gaussian, mean and median"))
+            }
+            None => Ok(()),
+        }
     }
 
     fn apply(&self, mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
-        let mut level_set = inputs.remove(0);
-        let half_width = level_set.half_width();
-        let narrow = half_width < NARROWEST_BAND;
-        if narrow {
-            level_set = with_half_width(&level_set, DEFAULT_HALF_WIDTH, run)?;
-        }
-        let report = smooth(&mut level_set, self, run)?;
-        let mut summary = Summary::from(&report);
-        if narrow {
-            level_set = level_set.narrowed(half_width);
-            summary.warnings.push(format!(
-                "a band of {half_width} voxels is too narrow to evolve: exact distances were rebuilt in one of {DEFAULT_HALF_WIDTH} first"
-            ));
-        }
-        if report.voxels == 0 && !level_set.is_empty() {
-            summary.warnings.push("the region touches no voxel of the narrow band: nothing was changed".into());
-        }
-        Ok(Outcome { level_set, summary })
+        evolved(inputs.remove(0), run, |level_set| smooth(level_set, self, run))
     }
 }
 
-/// The narrowest band, in voxels, that a flow is run in: the stencils of WENO5 reach three voxels, and in a band of 1.5 they
-/// see the cut-off values beside the surface (a smoothed ball got holes). Band widths from files differ in the last digits.
-const NARROWEST_BAND: f32 = DEFAULT_HALF_WIDTH - 0.01;
+impl Smooth {
+    /// The filter that is meant, if the method is one.
+    fn filter(&self) -> Option<Filter> {
+        let kind = match self.method {
+            SmoothMethod::Curvature | SmoothMethod::Laplacian => return None,
+            SmoothMethod::Gaussian => FilterKind::Gaussian,
+            SmoothMethod::Mean => FilterKind::Mean,
+            SmoothMethod::Median => FilterKind::Median,
+        };
+        Some(Filter { kind, width: self.width.unwrap_or(1) as usize })
+    }
+}
 
 /// Smooths in place. The band should be at least 3 voxels wide to each side.
 pub fn smooth(level_set: &mut LevelSet, params: &Smooth, run: &RunOptions) -> Result<Report> {
     params.validate()?;
-    let region = params.evolution.region.parse()?;
+    let region = params.evolution.region.on(level_set, run)?;
     let (region, until, solver) = (region.as_deref(), params.evolution.until(), params.evolution.solver(SOLVER));
+    if let Some(what) = params.filter() {
+        return filter(level_set, what, params.evolution.iterations.unwrap_or(1), region, &solver, run);
+    }
     match params.method {
-        SmoothMethod::Curvature => evolve(level_set, &MeanCurvatureFlow, region, until, &solver, run),
         SmoothMethod::Laplacian => evolve(level_set, &Diffusion, region, until, &solver, run),
+        _ => evolve(level_set, &MeanCurvatureFlow, region, until, &solver, run),
     }
 }
 
@@ -141,6 +164,13 @@ mod tests {
     use crate::grid::{Transform, offset_to_local};
     use crate::stencil::simd::{Isa, choose};
 
+    const METHODS: [SmoothMethod; 5] = [
+        SmoothMethod::Curvature,
+        SmoothMethod::Laplacian,
+        SmoothMethod::Gaussian,
+        SmoothMethod::Mean,
+        SmoothMethod::Median,
+    ];
     const CENTRE: DVec3 = DVec3::new(0.3, 0.2, -0.4);
 
     fn ball(radius: f64, half_width: f32, voxel_size: f64) -> LevelSet {
@@ -192,7 +222,12 @@ mod tests {
         // φ_t = Δφ moves a distance field by −2H: R² = R₀² − 4t, t = 60/6.
         let evolution = EvolutionOptions { iterations: Some(60), ..Default::default() };
         let mut level_set = ball(20.0, 3.0, 0.1);
-        smooth(&mut level_set, &Smooth { method: SmoothMethod::Laplacian, evolution }, &RunOptions::default()).unwrap();
+        smooth(
+            &mut level_set,
+            &Smooth { method: SmoothMethod::Laplacian, evolution, ..Default::default() },
+            &RunOptions::default(),
+        )
+        .unwrap();
         let (lo, hi) = radius_errors(&level_set, (400.0f64 - 40.0).sqrt());
         assert!(lo > -0.06 && hi < 0.06, "{lo} {hi}");
     }
@@ -209,12 +244,19 @@ mod tests {
     #[test]
     fn outside_the_region_every_bit_stays() {
         let before = ball(20.0, 3.0, 1.0);
-        let region = super::super::RegionSpecs(vec!["sphere center=20,0,0 radius=9".into()]);
-        let evolution = EvolutionOptions { iterations: Some(30), region, ..Default::default() };
-        let params = Smooth { evolution, ..Default::default() };
+        for method in METHODS {
+            let region = super::super::RegionSpecs(vec!["sphere center=20,0,0 radius=9".into()]);
+            let iterations = Some(if method == SmoothMethod::Curvature { 30 } else { 5 });
+            let evolution = EvolutionOptions { iterations, region, ..Default::default() };
+            let params = Smooth { method, evolution, ..Default::default() };
+            assert_only_the_region_changes(&before, &params);
+        }
+    }
+
+    fn assert_only_the_region_changes(before: &LevelSet, params: &Smooth) {
         let mut after = before.clone();
-        smooth(&mut after, &params, &RunOptions::default()).unwrap();
-        let weight = params.evolution.region.parse().unwrap().unwrap();
+        smooth(&mut after, params, &RunOptions::default()).unwrap();
+        let weight = params.evolution.region.on(before, &RunOptions::default()).unwrap().unwrap();
         let (mut frozen, mut moved) = (0, 0);
         for &id in before.grid().leaves() {
             for offset in before.grid().mask(id).iter() {
@@ -234,18 +276,19 @@ mod tests {
 
     #[test]
     fn every_instruction_set_and_thread_count_gives_the_same_bits() {
-        let evolution = EvolutionOptions { iterations: Some(5), ..Default::default() };
-        let params = Smooth { evolution, ..Default::default() };
-        let run = |isa, threads| {
+        let run = |method, isa, threads| {
+            let evolution = EvolutionOptions { iterations: Some(2), ..Default::default() };
+            let params = Smooth { method, evolution, ..Default::default() };
             choose(isa);
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let mut level_set = ball(30.0, 3.0, 0.3);
             pool.install(|| smooth(&mut level_set, &params, &RunOptions::default())).unwrap();
             level_set
         };
-        let first = run(Isa::Portable, 1);
-        for (isa, threads) in [(Isa::Avx2, 2), (Isa::Avx512, 3)] {
-            let other = run(isa, threads);
+        for (method, isa, threads) in
+            METHODS.into_iter().flat_map(|method| [(method, Isa::Avx2, 2), (method, Isa::Avx512, 3)])
+        {
+            let (first, other) = (run(method, Isa::Portable, 1), run(method, isa, threads));
             assert_eq!(first.grid().leaves().len(), other.grid().leaves().len());
             for &id in first.grid().leaves() {
                 let there = other.grid().find(first.grid().origin(id));
@@ -265,5 +308,20 @@ mod tests {
         assert_eq!(outcome.level_set.half_width(), 1.5);
         assert_eq!(outcome.level_set.measure(&RunOptions::default()).unwrap().euler, 2);
         assert!(outcome.summary.warnings[0].contains("too narrow"));
+    }
+
+    #[test]
+    fn widths_and_times_belong_to_their_methods() {
+        let check = |method, width, time| {
+            let evolution = EvolutionOptions { time, ..Default::default() };
+            Smooth { method, width, evolution }.validate().map_err(|e| e.to_string())
+        };
+        assert!(
+            check(SmoothMethod::Gaussian, None, None).is_ok() && check(SmoothMethod::Median, Some(8), None).is_ok()
+        );
+        assert!(check(SmoothMethod::Mean, Some(9), None).unwrap_err().contains("1 to 8"));
+        assert!(check(SmoothMethod::Mean, Some(0), None).unwrap_err().contains("1 to 8"));
+        assert!(check(SmoothMethod::Curvature, Some(1), None).unwrap_err().contains("gaussian, mean and median"));
+        assert!(check(SmoothMethod::Median, None, Some(1.0)).unwrap_err().contains("iterations"));
     }
 }

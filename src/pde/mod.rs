@@ -1,10 +1,12 @@
 //! Partial differential equations on the narrow band: the only time loop in the house.
 //!
-//! [`evolve`] moves a surface with a [`SpeedFunction`], [`morph_towards`] towards another one; [`renormalize`] restores |∇φ| = 1; [`track`] lets the band follow
+//! [`evolve`] moves a surface with a [`SpeedFunction`], [`morph_towards`] towards another one; [`filter()`] smooths the field; [`renormalize`] restores
+//! |∇φ| = 1; [`track`] lets the band follow
 //! the surface: dilate, renormalise, trim. A [`Tracker`] does these steps one by one.
 
 mod domain;
 mod evolve;
+mod filter;
 mod morph;
 mod renormalize;
 mod speed;
@@ -13,6 +15,7 @@ mod track;
 mod tracker;
 
 pub use evolve::{Report, StopReason, Until, evolve};
+pub use filter::{Filter, FilterKind, filter, offset};
 pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
 pub use speed::SpeedFunction;

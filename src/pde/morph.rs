@@ -312,7 +312,8 @@ mod tests {
     use super::*;
     use crate::grid::Transform;
     use crate::levelset::testing::{ball, sampled};
-    use crate::region::parse_regions;
+    use crate::region::{Primitive, Shape};
+    use glam::DMat3;
 
     const UPWIND: [UpwindScheme; 2] = [UpwindScheme::First, UpwindScheme::HjWeno5];
 
@@ -409,11 +410,11 @@ mod tests {
         assert!((radii(&moved, 14.0).0 - 14.0).abs() < 0.03);
 
         let aligned = sampled(20, |p| p.length() - 14.0);
-        let region = parse_regions(&["sphere center=12,0,0 radius=6".into()]).unwrap();
+        let sphere = Shape::Sphere { radius: 6.0 };
+        let region = Primitive::new(sphere, DVec3::X * 12.0, DMat3::IDENTITY, Primitive::DEFAULT_SOFT).unwrap();
         let mut part = from.clone();
         let options = MorphOptions::default();
-        morph_towards(&mut part, &aligned, region.as_deref(), Until::Time(3.0), &options, &RunOptions::default())
-            .unwrap();
+        morph_towards(&mut part, &aligned, Some(&region), Until::Time(3.0), &options, &RunOptions::default()).unwrap();
         assert_eq!(part.check(), []);
         let mut sampler = part.sampler();
         assert!(sampler.trilinear(DVec3::X * 13.5) < 0.0 && sampler.trilinear(DVec3::NEG_X * 12.0).abs() < 0.02);

@@ -3,14 +3,19 @@
 //! An operator's result is (1 − α)·old + α·new. Where α = 0, every voxel that was active keeps its bits. Regions are
 //! feathered by default, so that the result stays a distance at the region's rim.
 
+mod field;
+mod files;
+mod near;
+mod plan;
 mod primitive;
-mod spec;
 mod weights;
 
 use glam::DVec3;
 
-pub use primitive::{Primitive, Shape};
-pub use spec::parse_regions;
+pub use field::{Inside, Painted, Part};
+pub use near::Near;
+pub use plan::RegionPlan;
+pub use primitive::{HalfSpace, Primitive, Shape};
 pub use weights::RegionWeights;
 
 /// A weight in space.

@@ -146,6 +146,51 @@ impl Region for Primitive {
     }
 }
 
+/// One side of a plane: α = P(−f; 0, depth) with f = (x − point)·normal, 0 on the plane and 1 from `depth` behind it on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HalfSpace {
+    point: DVec3,
+    normal: DVec3,
+    depth: f64,
+}
+
+impl HalfSpace {
+    /// The side of the plane through `point` that `normal` points away from, full at `depth` (world units) behind it.
+    pub fn new(point: DVec3, normal: DVec3, depth: f64) -> Result<Self> {
+        let refuse =
+            |field: &str, value: String, accepted: &str| EditError::parameter("region", field, value, accepted);
+        let unit = normal.try_normalize().filter(|n| n.is_finite());
+        let unit = unit.ok_or_else(|| refuse("normal", normal.to_string(), "a finite vector that is not zero"))?;
+        if !point.is_finite() {
+            return Err(refuse("point", point.to_string(), "three finite numbers"));
+        }
+        if !(depth >= 0.0 && depth.is_finite()) {
+            return Err(refuse("soft", depth.to_string(), "a finite number of voxels, 0 or more"));
+        }
+        Ok(Self { point, normal: unit, depth })
+    }
+
+    /// −f: how far a position lies inside.
+    fn depth_of(&self, xyz: DVec3) -> f64 {
+        (self.point - xyz).dot(self.normal)
+    }
+}
+
+impl Region for HalfSpace {
+    fn weight(&self, xyz: DVec3) -> f32 {
+        ramp_between(self.depth_of(xyz), 0.0, self.depth) as f32
+    }
+
+    fn bounds(&self) -> Option<(DVec3, DVec3)> {
+        None
+    }
+
+    fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
+        let depth = self.depth_of(centre);
+        [-radius, radius].map(|by| ramp_between(depth + by * (1.0 + 1e-9), 0.0, self.depth) as f32)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -205,6 +250,18 @@ mod tests {
             }
             assert!(all > 0 && none > 40, "{region:?}: {all} {none}");
         }
+    }
+
+    #[test]
+    fn half_space_is_full_behind_its_rim() {
+        let region = HalfSpace::new(DVec3::X, DVec3::X * 5.0, 2.0).unwrap();
+        for (x, w) in [(2.0, 0.0), (1.0, 0.0), (0.0, 0.5), (-1.0, 1.0), (-50.0, 1.0)] {
+            assert_eq!(region.weight(DVec3::new(x, 7.0, -3.0)), w, "{x}");
+        }
+        assert_eq!(region.weights_within(DVec3::X * 3.0, 1.5), [0.0, 0.0]);
+        assert_eq!(region.weights_within(DVec3::X * -3.0, 1.5), [1.0, 1.0]);
+        assert_eq!(region.weights_within(DVec3::ZERO, 1.5), [0.0, 1.0]);
+        assert!(HalfSpace::new(DVec3::X, DVec3::ZERO, 2.0).is_err());
     }
 
     #[test]

@@ -6,8 +6,11 @@
 
 use std::fmt;
 
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
+
 use super::bridge::ffi;
-use crate::grid::{LeafMask, LeafValues};
+use crate::grid::{LEAF_VOXELS, LeafMask, LeafValues};
+use crate::stencil::simd::{Lanes, Work, dispatch};
 
 /// A band narrower than this on either side cannot carry a gradient: it must be rebuilt, not trimmed.
 const MIN_HALF_WIDTH_VOXELS: f64 = 1.0;
@@ -43,52 +46,44 @@ impl Range {
     }
 }
 
-/// The exponent bits of an f32: all set where it is infinite or no number.
-const EXPONENT: u32 = 0x7f80_0000;
-
-/// The 8 bits of a row's mask, each spread over the 32 bits of its voxel.
-static LANES: [[u32; 8]; 256] = {
-    let mut lanes = [[0; 8]; 256];
-    let mut row = 0;
-    while row < 256 {
-        let mut z = 0;
-        while z < 8 {
-            lanes[row][z] = if row >> z & 1 == 1 { u32::MAX } else { 0 };
-            z += 1;
-        }
-        row += 1;
-    }
-    lanes
-};
-
-/// A range for each of the 8 voxels of a row.
-struct RowRange {
-    low: [f32; 8],
-    high: [f32; 8],
+/// What [`BandFacts::of_leaf`] measures, two rows at a time.
+struct Scan<'a> {
+    values: &'a LeafValues,
+    mask: LeafMask,
+    facts: &'a mut BandFacts,
 }
 
-impl RowRange {
-    const EMPTY: Self = Self { low: [f32::INFINITY; 8], high: [f32::NEG_INFINITY; 8] };
-
-    /// Takes the values where all bits of `counts` are set, and ignores those where none is.
+impl Work for Scan<'_> {
     #[inline(always)]
-    fn add(&mut self, bits: &[u32; 8], counts: &[u32; 8]) {
-        for z in 0..8 {
-            let low = f32::from_bits((bits[z] & counts[z]) | (f32::INFINITY.to_bits() & !counts[z]));
-            // Comparisons with NaN are false: it changes neither end.
-            self.low[z] = if low < self.low[z] { low } else { self.low[z] };
+    fn run<S: Simd>(self, simd: S) {
+        let splat = |v| Lanes::splat(simd, v);
+        let infinity = splat(f32::INFINITY);
+        // Of the active voxels, the inactive ones inside, and those outside.
+        let mut low = [infinity; 3];
+        let mut high = [splat(f32::NEG_INFINITY); 3];
+        let mut finite = 0;
+        for (pair, values) in self.values.0.as_chunks::<16>().0.iter().enumerate() {
+            let v = Lanes::from_slice(simd, values);
+            let on = self.mask.0[pair / 4] >> (16 * (pair % 4)) & 0xffff;
+            // By the sign bit: a negative zero is inside.
+            let negative = splat(1.0).copysign(v).simd_lt(splat(0.0)).to_bitmask();
+            let sets = [on, !on & negative & 0xffff, !on & !negative & 0xffff];
+            for set in 0..3 {
+                let counts = mask32x16::from_bitmask(simd, sets[set]);
+                // Comparisons with NaN are false: it changes neither end.
+                let below = counts.select(v, infinity);
+                low[set] = below.simd_lt(low[set]).select(below, low[set]);
+                let above = counts.select(v, -infinity);
+                high[set] = above.simd_gt(high[set]).select(above, high[set]);
+            }
+            finite += v.abs().simd_lt(infinity).to_bitmask().count_ones();
         }
-        for z in 0..8 {
-            let high = f32::from_bits((bits[z] & counts[z]) | (f32::NEG_INFINITY.to_bits() & !counts[z]));
-            self.high[z] = if high > self.high[z] { high } else { self.high[z] };
+        let ranges = [&mut self.facts.active, &mut self.facts.inactive_inside, &mut self.facts.inactive_outside];
+        for (set, range) in ranges.into_iter().enumerate() {
+            low[set].as_slice().iter().for_each(|v| range.low = range.low.min(f64::from(*v)));
+            high[set].as_slice().iter().for_each(|v| range.high = range.high.max(f64::from(*v)));
         }
-    }
-
-    fn joined(&self) -> Range {
-        let mut range = Range::EMPTY;
-        self.low.iter().for_each(|v| range.low = range.low.min(f64::from(*v)));
-        self.high.iter().for_each(|v| range.high = range.high.max(f64::from(*v)));
-        range
+        self.facts.non_finite = u64::from(LEAF_VOXELS as u32 - finite);
     }
 }
 
@@ -137,32 +132,11 @@ impl BandFacts {
         Ok(())
     }
 
-    /// Rows of 8 voxels side by side and without branches, so that the compiler uses vector instructions: branches make this
-    /// pass take longer than reading the leaf.
+    /// With vector instructions: one voxel at a time, this takes longer than reading the leaf.
     pub(super) fn of_leaf(values: &LeafValues, mask: LeafMask) -> Self {
-        let mut active = RowRange::EMPTY;
-        let mut inside = RowRange::EMPTY;
-        let mut outside = RowRange::EMPTY;
-        let mut non_finite = [0u32; 8];
-        let (rows, _) = values.0.as_chunks::<8>();
-        for (row, values) in rows.iter().enumerate() {
-            let on = LANES[usize::from(mask.row(row / 8, row % 8))];
-            let bits = values.map(f32::to_bits);
-            let negative = bits.map(|b| ((b as i32) >> 31) as u32);
-            active.add(&bits, &on);
-            inside.add(&bits, &std::array::from_fn(|z| !on[z] & negative[z]));
-            outside.add(&bits, &std::array::from_fn(|z| !on[z] & !negative[z]));
-            for z in 0..8 {
-                non_finite[z] += u32::from(bits[z] & EXPONENT == EXPONENT);
-            }
-        }
-        Self {
-            active: active.joined(),
-            inactive_inside: inside.joined(),
-            inactive_outside: outside.joined(),
-            non_finite: non_finite.iter().map(|n| u64::from(*n)).sum(),
-            ..Self::new(0.0)
-        }
+        let mut facts = Self::new(0.0);
+        dispatch(Scan { values, mask, facts: &mut facts });
+        facts
     }
 
     fn add_inactive(&mut self, value: f64) {

@@ -74,6 +74,9 @@ pub(super) mod ffi {
         fn grid_header(self: &Archive, index: usize) -> Result<GridHeader>;
         fn read_path(path: &[u8], headers_only: bool) -> Result<UniquePtr<Archive>>;
         fn read_bytes(bytes: &[u8], headers_only: bool) -> Result<UniquePtr<Archive>>;
+        fn fingerprint_path(path: &[u8]) -> Result<UniquePtr<Archive>>;
+        fn fingerprint_bytes(bytes: &[u8]) -> Result<UniquePtr<Archive>>;
+        fn release_voxels(archive: Pin<&mut Archive>, index: usize) -> Result<()>;
         fn grid_fingerprint(archive: &Archive, index: usize) -> Result<String>;
 
         type Leaves;
@@ -113,6 +116,9 @@ pub(super) mod ffi {
         fn seal(self: Pin<&mut Output>) -> Result<()>;
         fn verify(self: &Output, archive: &Archive) -> Result<String>;
 
+        fn plain_write(grid: &FloatGrid, path: &[u8]) -> Result<()>;
+        fn plain_read(path: &[u8]) -> Result<UniquePtr<FloatGrid>>;
+
         type RawMesh;
         fn point_count(self: &RawMesh) -> usize;
         fn triangle_count(self: &RawMesh) -> usize;
@@ -143,6 +149,7 @@ pub(super) mod ffi {
             triangles: &[u32],
             matrix: &[f64],
             half_width: f32,
+            renormalize: bool,
         ) -> Result<UniquePtr<FloatGrid>>;
         fn volume_to_mesh(grid: &FloatGrid, iso: f64, adaptivity: f64) -> Result<UniquePtr<RawMesh>>;
         fn level_set_area(grid: &FloatGrid) -> Result<f64>;

@@ -13,7 +13,7 @@ use super::listing::{FileListing, Precision};
 use super::select::select_level_set;
 use super::structure::{START_BYTES, check_start};
 use crate::error::{EditError, Result};
-use crate::grid::{Grid, LEAF_DIM, MAX_COORD};
+use crate::grid::{Grid, LEAF_DIM, LeafMask, LeafValues, MAX_COORD, PageLeaves};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 
@@ -33,6 +33,8 @@ pub struct VdbFile {
     pub(super) archive: UniquePtr<ffi::Archive>,
     listing: FileListing,
     pub(super) path: std::path::PathBuf,
+    /// The grids whose voxels were given away.
+    taken: Vec<usize>,
 }
 
 /// A level set as it was read.
@@ -60,7 +62,7 @@ pub fn open(path: impl AsRef<Path>, run: &RunOptions) -> Result<VdbFile> {
     }
     let archive = open_archive(path, false)?;
     let listing = FileListing::of(&archive).map_err(|e| EditError::input(path, e.what()))?;
-    Ok(VdbFile { archive, listing, path: path.into() })
+    Ok(VdbFile { archive, listing, path: path.into(), taken: Vec::new() })
 }
 
 impl VdbFile {
@@ -82,6 +84,7 @@ impl VdbFile {
         let listing = &self.listing.grids[index];
         let refuse =
             |reason: String| self.error(format!("grid `{}` cannot be a level set: {reason}", listing.selector));
+        self.check_present(index)?;
         let transform = listing.uniform_transform().map_err(refuse)?;
         let leaves = ffi::archive_leaves(&self.archive, index).map_err(|e| refuse(e.what().into()))?;
         let (mut grid, facts) = read_grid(&leaves, transform.voxel_size()).map_err(refuse)?;
@@ -90,6 +93,23 @@ impl VdbFile {
         }
         let band = diagnose_band(&facts, transform.voxel_size());
         Ok(ReadLevelSet { level_set: LevelSet::new(grid, transform), index, band, facts })
+    }
+
+    /// As [`read_level_set`](Self::read_level_set), and lets go of the voxels that OpenVDB holds: they are not in memory
+    /// twice. What is left of the grid is what a result in its place takes over; it cannot be read or written again.
+    pub fn take_level_set(&mut self, selector: Option<&str>, assume_level_set: bool) -> Result<ReadLevelSet> {
+        let read = self.read_level_set(selector, assume_level_set)?;
+        ffi::release_voxels(self.archive.pin_mut(), read.index).map_err(|e| self.error(e.what()))?;
+        self.taken.push(read.index);
+        Ok(read)
+    }
+
+    /// Fails if the voxels of a grid were taken.
+    pub(super) fn check_present(&self, index: usize) -> Result<()> {
+        match self.taken.contains(&index) {
+            true => Err(self.error(format!("the voxels of grid `{}` were taken", self.listing.grids[index].selector))),
+            false => Ok(()),
+        }
     }
 
     /// 128 bits, as text, that are equal for grids of the same structure and values: for tests and comparisons.
@@ -190,28 +210,38 @@ pub(super) fn read_grid(leaves: &ffi::Leaves, voxel_size: f64) -> Result<(Grid, 
     let mut grid = Grid::from_origins(background, &origins);
     // A fresh grid has its leaves in slot order.
     let first = grid.leaves().first().map_or(0, |id| id.index());
-    let failed = std::sync::Mutex::new(None);
-    grid.update_all(|id, values, mask| {
-        if let Err(e) = leaves.copy(order[id.index() - first].1, &mut values.0, &mut mask.0) {
-            failed.lock().unwrap_or_else(|p| p.into_inner()).get_or_insert(e.what().to_string());
-        }
-    });
-    if let Some(problem) = failed.into_inner().unwrap_or_else(|p| p.into_inner()) {
-        return Err(problem);
-    }
-    let of_leaves = grid.map_leaves(|id| BandFacts::of_leaf(grid.values(id), grid.mask(id)));
-    of_leaves.iter().for_each(|leaf| facts.join(leaf));
-    if facts.has_odd_inactive(background) {
-        grid.update_all(|_, values, mask| {
-            for (offset, value) in values.0.iter_mut().enumerate() {
-                if !mask.get(offset) {
-                    *value = background.copysign(*value);
-                }
+    let all = grid.leaf_set().clone();
+    let pages = grid.update_pages(&all, |page, values, masks| {
+        let mut facts = BandFacts::new(0.0);
+        let mut failed = None;
+        page.for_each(|id| {
+            let (values, mask) = (&mut values[PageLeaves::slot(id)], &mut masks[PageLeaves::slot(id)]);
+            if let Err(e) = leaves.copy(order[id.index() - first].1, &mut values.0, &mut mask.0) {
+                failed.get_or_insert(e.what().to_string());
             }
+            // While the leaf is in the cache.
+            let of_leaf = BandFacts::of_leaf(values, *mask);
+            if of_leaf.has_odd_inactive(background) {
+                set_inactive(values, *mask, background);
+            }
+            facts.join(&of_leaf);
         });
+        failed.map_or(Ok(facts), Err)
+    });
+    for page in pages {
+        facts.join(&page?);
     }
     set_signs(&mut grid, leaves)?;
     Ok((grid, facts))
+}
+
+/// Sets inactive voxels to the background of their sign.
+fn set_inactive(values: &mut LeafValues, mask: LeafMask, background: f32) {
+    for (offset, value) in values.0.iter_mut().enumerate() {
+        if !mask.get(offset) {
+            *value = background.copysign(*value);
+        }
+    }
 }
 
 /// Gives the space between the leaves the signs of the tiles.

@@ -3,6 +3,8 @@
 //! A [`ReferenceGrid`] is held by OpenVDB; conversions copy whole leaves. Distances are in world units and positive outwards,
 //! as everywhere here (OpenVDB's own offset erodes when positive).
 
+use std::path::Path;
+
 use cxx::UniquePtr;
 use glam::Vec3;
 
@@ -81,15 +83,39 @@ pub enum Csg {
     Difference,
 }
 
-/// A mesh as OpenVDB extracts it.
-#[derive(Clone, Debug, Default)]
+/// A mesh as OpenVDB extracts it, still held by OpenVDB.
 pub struct ReferenceMesh {
+    raw: UniquePtr<ffi::RawMesh>,
+}
+
+impl ReferenceMesh {
     /// Vertices in world space.
-    pub points: Vec<Vec3>,
+    pub fn points(&self) -> Result<Vec<Vec3>> {
+        let mut flat = vec![0.0; self.raw.point_count() * 3];
+        self.raw.points(&mut flat).map_err(failed)?;
+        Ok(flat.chunks_exact(3).map(Vec3::from_slice).collect())
+    }
+
     /// Triangles; none unless adaptive.
-    pub triangles: Vec<[u32; 3]>,
+    pub fn triangles(&self) -> Result<Vec<[u32; 3]>> {
+        let mut triangles = vec![[0; 3]; self.raw.triangle_count()];
+        self.raw.triangles(triangles.as_flattened_mut()).map_err(failed)?;
+        Ok(triangles)
+    }
+
     /// Quadrilaterals.
-    pub quads: Vec<[u32; 4]>,
+    pub fn quads(&self) -> Result<Vec<[u32; 4]>> {
+        let mut quads = vec![[0; 4]; self.raw.quad_count()];
+        self.raw.quads(quads.as_flattened_mut()).map_err(failed)?;
+        Ok(quads)
+    }
+
+    /// All polygons as triangles: quadrilaterals parted by the diagonal from their first corner. As OpenVDB turns them,
+    /// clockwise seen from outside.
+    pub fn all_triangles(&self) -> Result<Vec<[u32; 3]>> {
+        let halves = self.quads()?.into_iter().flat_map(|[a, b, c, d]| [[a, b, c], [a, c, d]]);
+        Ok(halves.chain(self.triangles()?).collect())
+    }
 }
 
 /// A float grid held by OpenVDB.
@@ -118,8 +144,30 @@ impl ReferenceGrid {
 
     /// OpenVDB's meshToLevelSet: triangles in world space, half width in voxels.
     pub fn from_mesh(points: &[Vec3], triangles: &[[u32; 3]], transform: Transform, half_width: f32) -> Result<Self> {
+        Self::converted(points, triangles, transform, half_width, true)
+    }
+
+    /// As [`from_mesh`](Self::from_mesh), without what it does to the distances in the end (`DISABLE_RENORMALIZATION`,
+    /// `DISABLE_INTERSECTING_VOXEL_REMOVAL`).
+    pub fn from_mesh_unnormalized(
+        points: &[Vec3],
+        triangles: &[[u32; 3]],
+        transform: Transform,
+        half_width: f32,
+    ) -> Result<Self> {
+        Self::converted(points, triangles, transform, half_width, false)
+    }
+
+    fn converted(
+        points: &[Vec3],
+        triangles: &[[u32; 3]],
+        transform: Transform,
+        half_width: f32,
+        renormalize: bool,
+    ) -> Result<Self> {
         let flat: Vec<f32> = points.iter().flat_map(|p| p.to_array()).collect();
-        let grid = ffi::mesh_to_level_set(&flat, triangles.as_flattened(), &matrix(&transform), half_width);
+        let grid =
+            ffi::mesh_to_level_set(&flat, triangles.as_flattened(), &matrix(&transform), half_width, renormalize);
         Ok(Self { grid: grid.map_err(failed)?, transform })
     }
 
@@ -192,20 +240,18 @@ impl ReferenceGrid {
 
     /// OpenVDB's volumeToMesh at `iso` (world units).
     pub fn to_mesh(&self, iso: f64, adaptivity: f64) -> Result<ReferenceMesh> {
-        let raw = ffi::volume_to_mesh(&self.grid, iso, adaptivity).map_err(failed)?;
-        let mut mesh = ReferenceMesh {
-            points: vec![Vec3::ZERO; raw.point_count()],
-            triangles: vec![[0; 3]; raw.triangle_count()],
-            quads: vec![[0; 4]; raw.quad_count()],
-        };
-        let mut points = vec![0.0; raw.point_count() * 3];
-        raw.points(&mut points).map_err(failed)?;
-        for (to, from) in mesh.points.iter_mut().zip(points.chunks_exact(3)) {
-            *to = Vec3::from_slice(from);
-        }
-        raw.triangles(mesh.triangles.as_flattened_mut()).map_err(failed)?;
-        raw.quads(mesh.quads.as_flattened_mut()).map_err(failed)?;
-        Ok(mesh)
+        Ok(ReferenceMesh { raw: ffi::volume_to_mesh(&self.grid, iso, adaptivity).map_err(failed)? })
+    }
+
+    /// Writes a file of this grid alone through OpenVDB's own interface: blosc, neither flushed nor verified.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        ffi::plain_write(&self.grid, path.as_os_str().as_encoded_bytes()).map_err(failed)
+    }
+
+    /// Reads the float grid of a file through OpenVDB's own interface, voxels included; `transform` is what it has.
+    pub fn read(path: &Path, transform: Transform) -> Result<Self> {
+        let grid = ffi::plain_read(path.as_os_str().as_encoded_bytes()).map_err(failed)?;
+        Ok(Self { grid, transform })
     }
 
     /// OpenVDB's levelSetArea, in world units squared.

@@ -8,7 +8,7 @@ use glam::IVec3;
 use super::VdbFile;
 use super::bridge::ffi;
 use crate::error::{EditError, Result};
-use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, MAX_COORD};
+use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafValues, MAX_COORD, Volume};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 
@@ -82,6 +82,32 @@ impl VdbFile {
         fill(&mut grid, &places, &leaves, iso).map_err(refuse)?;
         surround(&mut grid);
         Ok(LevelSet::new(grid, transform))
+    }
+}
+
+impl VdbFile {
+    /// A grid of numbers as it is: leaves, tiles and background.
+    pub fn read_volume(&self, index: usize, run: &RunOptions) -> Result<Volume> {
+        let listing = &self.listing().grids[index];
+        let refuse = |problem: String| EditError::input(&self.path, format!("grid `{}`: {problem}", listing.selector));
+        let failed = |e: cxx::Exception| refuse(e.what().into());
+        let transform = listing.uniform_transform().map_err(refuse)?;
+        let leaves = ffi::archive_leaves(&self.archive, index).map_err(failed)?;
+        let bytes = leaves.count() as u64 * size_of::<LeafValues>() as u64;
+        run.reserve("reading a volume", bytes, "take a smaller volume")?;
+        let mut flat = vec![0; leaves.count() * 3];
+        leaves.origins(&mut flat).map_err(failed)?;
+        let mut volume = Volume::new(transform, leaves.background() as f32);
+        for (leaf, origin) in flat.as_chunks::<3>().0.iter().enumerate() {
+            let (mut values, mut active) = (Box::new(LeafValues::default()), LeafMask::EMPTY);
+            leaves.copy(leaf, &mut values.0, &mut active.0).map_err(failed)?;
+            volume.insert_leaf(IVec3::from_array(*origin), values);
+        }
+        for tile in leaves.tiles().map_err(failed)? {
+            // The root's tiles are as large as an internal node of the tree.
+            volume.insert_tile(corner(&tile), tile.size as i32, tile.value);
+        }
+        Ok(volume)
     }
 }
 

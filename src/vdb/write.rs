@@ -94,6 +94,11 @@ pub fn write_with_fields(
             "OpenVDB stores no voxels smaller than {SMALLEST_VOXEL} world units, these are {small:e}: scale the model up, as by `transform --scale 1000`"
         )));
     }
+    if let (Some(file), false) = (input, options.only_result) {
+        for index in (0..file.listing().grids.len()).filter(|index| grids.iter().all(|g| g.replaces != Some(*index))) {
+            file.check_present(index)?;
+        }
+    }
     let (mut content, mut count) = collect(grids, input, options).map_err(|e| output.error(e.what()))?;
     for field in fields {
         let made = to_openvdb_field(field, options).and_then(|grid| content.pin_mut().add_grid(grid));
@@ -253,7 +258,7 @@ impl Target<'_> {
     ) -> Result<u64> {
         let bytes = content.as_mut().write_bytes(compression).map_err(|e| self.error(e.what()))?;
         content.as_mut().seal().map_err(|e| self.error(e.what()))?;
-        self.verify(&content, || ffi::read_bytes(bytes.as_bytes(), false))?;
+        self.verify(&content, || ffi::fingerprint_bytes(bytes.as_bytes()))?;
         to.write_all(bytes.as_bytes()).and_then(|()| to.flush()).map_err(self.io("writing"))?;
         Ok(bytes.len() as u64)
     }
@@ -274,10 +279,16 @@ impl Target<'_> {
         let _unfinished = Unfinished::new(temporary.path());
         let name = temporary.path().as_os_str().as_encoded_bytes();
         content.as_mut().write_path(name, compression).map_err(|e| self.error(e.what()))?;
-        temporary.as_file().sync_all().map_err(self.io("flushing"))?;
-        // Before reading back, so that the two copies are never in memory together.
-        content.as_mut().seal().map_err(|e| self.error(e.what()))?;
-        self.verify(&content, || ffi::read_path(name, false))?;
+        // The disk and the processor have different work to do.
+        let verified = std::thread::scope(|scope| {
+            let flushed = scope.spawn(|| temporary.as_file().sync_all());
+            // Sealed before it is read back, so that the two copies are never in memory together.
+            let sealed = content.as_mut().seal().map_err(|e| self.error(e.what()));
+            let verified = sealed.and_then(|()| self.verify(&content, || ffi::fingerprint_path(name)));
+            let flushed = flushed.join().unwrap_or_else(|_| Err(std::io::Error::other("the flushing thread failed")));
+            flushed.map_err(self.io("flushing")).and(verified)
+        });
+        verified?;
         let bytes = temporary.as_file().metadata().map_err(self.io("flushing"))?.len();
         if let Some(old) = old {
             temporary.as_file().set_permissions(old.permissions()).map_err(self.io("setting its permissions"))?;

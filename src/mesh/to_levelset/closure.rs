@@ -11,12 +11,15 @@ use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::inside::{APART, Inside};
+use super::inside::Inside;
 use crate::error::Result;
 use crate::grid::{LEAF_DIM, LeafMask, LeafValues, leaf_offset, leaf_origin};
-use crate::mesh::WindingNumber;
 use crate::mesh::scatter::UnsignedLeaf;
 use crate::run::RunOptions;
+
+/// Neighbouring voxels whose distances to the triangles add up to more than their own distance are not separated.
+/// The excess covers the rounding of the distances.
+const APART: f32 = 1.0 + 1e-5;
 
 const AXES: [IVec3; 3] = [IVec3::X, IVec3::Y, IVec3::Z];
 
@@ -69,15 +72,12 @@ impl DistanceLeaves {
 /// The signs of a surface's surroundings, extended as far as they are asked for.
 pub(super) struct Surroundings<'a> {
     inside: &'a Inside<'a>,
-    winding: &'a WindingNumber<'a>,
-    /// Distances to all triangles of the mesh.
-    all: &'a DistanceLeaves,
     masks: FxHashMap<IVec3, LeafMask>,
 }
 
 impl<'a> Surroundings<'a> {
-    pub fn new(inside: &'a Inside<'a>, winding: &'a WindingNumber<'a>, all: &'a DistanceLeaves) -> Self {
-        Self { inside, winding, all, masks: FxHashMap::default() }
+    pub fn new(inside: &'a Inside<'a>) -> Self {
+        Self { inside, masks: FxHashMap::default() }
     }
 
     /// The inside of the leaf at `origin`, if it is known.
@@ -87,8 +87,7 @@ impl<'a> Surroundings<'a> {
 
     /// Finds the signs of the leaves at `origins`.
     pub fn extend(&mut self, origins: &[IVec3]) {
-        let masks: Vec<_> =
-            origins.par_iter().map(|&origin| (origin, self.inside.leaf(origin, self.all.find(origin)))).collect();
+        let masks: Vec<_> = origins.par_iter().map(|&origin| (origin, self.inside.leaf(origin))).collect();
         self.masks.extend(masks);
     }
 
@@ -96,9 +95,16 @@ impl<'a> Surroundings<'a> {
         self.masks.get(&leaf_origin(ijk)).is_some_and(|m| m.get(leaf_offset(ijk)))
     }
 
-    /// The triangles that close the surface whose distances are `kept`, with the signs of everything around them.
-    pub fn close(&mut self, kept: &DistanceLeaves, half_width: f32, run: &RunOptions) -> Result<Vec<[DVec3; 3]>> {
-        let mut fresh: Vec<IVec3> = self.all.origins().chain(kept.origins()).collect();
+    /// The triangles that close the surface whose distances are `kept`, with the signs of everything around them. It may be open
+    /// in the leaves of `kept` and those at the origins `suspects`.
+    pub fn close(
+        &mut self,
+        kept: &DistanceLeaves,
+        suspects: &[IVec3],
+        half_width: f32,
+        run: &RunOptions,
+    ) -> Result<Vec<[DVec3; 3]>> {
+        let mut fresh: Vec<IVec3> = suspects.iter().copied().chain(kept.origins()).collect();
         let mut edges: Vec<OpenEdge> = Vec::new();
         while !fresh.is_empty() {
             run.check("mesh to level set")?;
@@ -194,7 +200,7 @@ impl<'a> Surroundings<'a> {
     /// Where along an open edge the winding number is ½.
     fn half_level(&self, edge: OpenEdge) -> f64 {
         let ijk = IVec3::from_array(edge.ijk);
-        let [a, b] = [ijk, ijk + AXES[edge.axis]].map(|p| self.winding.at(p.as_dvec3()) - 0.5);
+        let [a, b] = [ijk, ijk + AXES[edge.axis]].map(|p| self.inside.winding(p) - 0.5);
         // At the edge of a sheet the two may not bracket ½, where the sign came from crossings.
         if a * b < 0.0 { a / (a - b) } else { 0.5 }
     }

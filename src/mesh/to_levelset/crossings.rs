@@ -10,7 +10,8 @@
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 
-use crate::grid::{LeafMask, leaf_offset};
+use crate::grid::{LeafMask, leaf_origin};
+use crate::mesh::bins::{Bins, ceil, ceil1, floor};
 
 /// Columns along the edge of a tile: the unit of parallel work.
 const TILE: i32 = 32;
@@ -31,58 +32,82 @@ struct Tile {
     key: [i32; 2],
     starts: Vec<u32>,
     crossings: Vec<Crossing>,
-    overlaps: u64,
+    overlaps: Vec<IVec3>,
 }
 
 /// The crossings of all rows in z with a closed mesh.
 pub(super) struct Crossings {
     tiles: Vec<Tile>,
+    overlaps: Vec<IVec3>,
 }
 
 impl Crossings {
     /// Finds the crossings of the triangles, given in index space and fit for i32.
     pub fn new(count: usize, triangle: impl Fn(usize) -> [DVec3; 3] + Sync) -> Self {
-        let mut pairs: Vec<([i32; 2], u32)> = (0..count as u32)
-            .into_par_iter()
-            .with_min_len(1024)
-            .flat_map_iter(|t| {
-                let [a, b, c] = triangle(t as usize);
-                let tile = |p: DVec3| p.as_ivec3().div_euclid(IVec3::splat(TILE));
-                let (lo, hi) = (tile(a.min(b).min(c).ceil()), tile(a.max(b).max(c).floor()));
-                (lo.x..=hi.x).flat_map(move |x| (lo.y..=hi.y).map(move |y| ([x, y], t)))
-            })
-            .collect();
-        pairs.par_sort_unstable();
-        let tiles: Vec<&[([i32; 2], u32)]> = pairs.chunk_by(|a, b| a.0 == b.0).collect();
-        Self { tiles: tiles.par_iter().filter_map(|tile| scan_tile(tile, &triangle)).collect() }
+        let bins = Bins::new(count, |t, tiles: &mut Vec<[i32; 2]>| {
+            let [a, b, c] = triangle(t);
+            let (lo, hi) = (ceil(a.min(b).min(c)), floor(a.max(b).max(c)));
+            for x in lo.x.div_euclid(TILE)..=hi.x.div_euclid(TILE) {
+                tiles.extend((lo.y.div_euclid(TILE)..=hi.y.div_euclid(TILE)).map(|y| [x, y]));
+            }
+        });
+        let tile = |bin| scan_tile(*bins.key(bin), bins.items(bin), &triangle);
+        let mut tiles: Vec<Tile> = (0..bins.len()).into_par_iter().filter_map(tile).collect();
+        let overlaps = tiles.iter_mut().flat_map(|tile| std::mem::take(&mut tile.overlaps)).collect();
+        Self { tiles, overlaps }
     }
 
-    /// Number of places where a row passes between levels other than 0 and 1: parts of the surface lie inside each other
-    /// or face the wrong way.
-    pub fn overlaps(&self) -> u64 {
-        self.tiles.iter().map(|t| t.overlaps).sum()
+    /// Leaves where a row passes to or from levels other than 0 and 1: parts of the surface lie inside each other or
+    /// face the wrong way.
+    pub fn overlaps(&self) -> &[IVec3] {
+        &self.overlaps
+    }
+
+    /// The winding number of a voxel.
+    pub fn level(&self, ijk: IVec3) -> i32 {
+        let key = [ijk.x.div_euclid(TILE), ijk.y.div_euclid(TILE)];
+        let Ok(found) = self.tiles.binary_search_by_key(&key, |t| t.key) else { return 0 };
+        self.tiles[found].row(ijk.x, ijk.y).iter().take_while(|c| c.first <= ijk.z).map(|c| c.step).sum()
     }
 
     /// Which voxels of the leaf at `origin` have a winding number of 1 or more.
     pub fn inside(&self, origin: IVec3) -> LeafMask {
+        self.at_least(origin, 1)
+    }
+
+    /// Which voxels of the leaf at `origin` have a winding number of at least `least`.
+    pub fn at_least(&self, origin: IVec3, least: i32) -> LeafMask {
         let mut mask = LeafMask::EMPTY;
         let key = [origin.x.div_euclid(TILE), origin.y.div_euclid(TILE)];
-        let Ok(found) = self.tiles.binary_search_by_key(&key, |t| t.key) else { return mask };
+        let Ok(found) = self.tiles.binary_search_by_key(&key, |t| t.key) else {
+            return if least > 0 { mask } else { LeafMask::FULL };
+        };
         let tile = &self.tiles[found];
-        for x in origin.x..origin.x + 8 {
-            for y in origin.y..origin.y + 8 {
-                let mut row = tile.row(x, y).iter().peekable();
-                let mut level = 0;
-                for z in origin.z..origin.z + 8 {
-                    while let Some(crossing) = row.next_if(|c| c.first <= z) {
-                        level += crossing.step;
-                    }
-                    mask.set(leaf_offset(IVec3::new(x, y, z)), level >= 1);
-                }
+        for (x, word) in (origin.x..).zip(&mut mask.0) {
+            for (y, shift) in (origin.y..).zip((0..64).step_by(8)) {
+                *word |= u64::from(at_least_in_row(tile.row(x, y), origin.z, least)) << shift;
             }
         }
         mask
     }
+}
+
+/// A bit for each of eight voxels from `start`, set where the winding number is at least `least`.
+fn at_least_in_row(row: &[Crossing], start: i32, least: i32) -> u8 {
+    let (mut level, mut inside) = (0, if least > 0 { 0u8 } else { 0xff });
+    for crossing in row {
+        let above = crossing.first.saturating_sub(start);
+        if above >= 8 {
+            break;
+        }
+        let was = level >= least;
+        level += crossing.step;
+        if was != (level >= least) {
+            // All from here up change.
+            inside ^= 0xff << above.max(0);
+        }
+    }
+    inside
 }
 
 impl Tile {
@@ -92,44 +117,61 @@ impl Tile {
     }
 }
 
+/// A crossing while its tile is scanned.
+#[derive(Clone, Copy)]
+struct Found {
+    row: u32,
+    step: i32,
+    height: f64,
+}
+
 /// The crossings in one tile; `None` if there are none.
-fn scan_tile(pairs: &[([i32; 2], u32)], triangle: &impl Fn(usize) -> [DVec3; 3]) -> Option<Tile> {
-    let key = pairs.first()?.0;
-    // Row, height, step.
-    let mut found: Vec<(u32, f64, i32)> = Vec::new();
-    for &(_, t) in pairs {
+fn scan_tile(key: [i32; 2], triangles: &[u32], triangle: &impl Fn(usize) -> [DVec3; 3]) -> Option<Tile> {
+    let mut found: Vec<Found> = Vec::with_capacity(triangles.len());
+    for &t in triangles {
         scan_triangle(triangle(t as usize), key, &mut found);
     }
-    found.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
-    if found.is_empty() {
-        return None;
-    }
+    let any = *found.first()?;
+    // Gathered by row, then sorted within each: rows are short.
     let mut starts = vec![0u32; (TILE * TILE) as usize + 1];
-    found.iter().for_each(|f| starts[f.0 as usize + 1] += 1);
+    found.iter().for_each(|f| starts[f.row as usize + 1] += 1);
     for row in 1..starts.len() {
         starts[row] += starts[row - 1];
     }
-    let mut overlaps = 0;
-    for row in found.chunk_by(|a, b| a.0 == b.0) {
+    let mut next = starts.clone();
+    let mut by_row = vec![any; found.len()];
+    for f in &found {
+        let at = &mut next[f.row as usize];
+        by_row[*at as usize] = *f;
+        *at += 1;
+    }
+    let mut overlaps = Vec::new();
+    for row in by_row.chunk_by_mut(|a, b| a.row == b.row) {
+        row.sort_unstable_by(|a, b| a.height.total_cmp(&b.height).then(a.step.cmp(&b.step)));
         let mut level = 0;
-        for (i, &(_, height, step)) in row.iter().enumerate() {
-            level += step;
-            let settled = row.get(i + 1).is_none_or(|next| next.1 - height > COINCIDENT);
-            overlaps += u64::from(settled && !(0..=1).contains(&level));
+        for (i, f) in row.iter().enumerate() {
+            level += f.step;
+            let settled = row.get(i + 1).is_none_or(|next| next.height - f.height > COINCIDENT);
+            if settled && !(0..=1).contains(&level) {
+                let [x, y] = [f.row as i32 / TILE + key[0] * TILE, f.row as i32 % TILE + key[1] * TILE];
+                let ends = [Some(f), row.get(i + 1)].into_iter().flatten();
+                overlaps.extend(ends.map(|f| leaf_origin(IVec3::new(x, y, ceil1(f.height)))));
+            }
         }
     }
-    let crossings = found.iter().map(|&(_, height, step)| Crossing { first: height.ceil() as i32, step }).collect();
+    overlaps.sort_unstable_by_key(IVec3::to_array);
+    overlaps.dedup();
+    let crossings = by_row.iter().map(|f| Crossing { first: ceil1(f.height), step: f.step }).collect();
     Some(Tile { key, starts, crossings, overlaps })
 }
 
 /// Adds the crossings of one triangle with the rows of tile `key`.
-fn scan_triangle(corners: [DVec3; 3], key: [i32; 2], found: &mut Vec<(u32, f64, i32)>) {
-    let [a, b, c] = corners;
+fn scan_triangle([a, b, c]: [DVec3; 3], key: [i32; 2], found: &mut Vec<Found>) {
     let first = [key[0] * TILE, key[1] * TILE];
-    let low = (a.y.min(b.y).min(c.y).ceil() as i32).max(first[1]);
-    let high = (a.y.max(b.y).max(c.y).floor() as i32).min(first[1] + TILE - 1);
+    let low = ceil1(a.y.min(b.y).min(c.y)).max(first[1]);
+    let high = (-ceil1(-a.y.max(b.y).max(c.y))).min(first[1] + TILE - 1);
     for j in low..=high {
-        let y = j as f64;
+        let y = f64::from(j);
         let (mut rising, mut falling) = (None, None);
         for (from, to) in [(a, b), (b, c), (c, a)] {
             match (from.y <= y, to.y <= y) {
@@ -141,12 +183,12 @@ fn scan_triangle(corners: [DVec3; 3], key: [i32; 2], found: &mut Vec<(u32, f64, 
         let (Some(rising), Some(falling)) = (rising, falling) else { continue };
         // Seen from above, a triangle that faces up runs counter-clockwise: its rising edge is the right one.
         let (left, right, step) = if rising.0 > falling.0 { (falling, rising, -1) } else { (rising, falling, 1) };
-        let start = (left.0.ceil() as i32).max(first[0]);
-        let end = (right.0.ceil() as i32).min(first[0] + TILE);
+        let start = ceil1(left.0).max(first[0]);
+        let end = ceil1(right.0).min(first[0] + TILE);
         for i in start..end {
-            let t = (i as f64 - left.0) / (right.0 - left.0);
+            let t = (f64::from(i) - left.0) / (right.0 - left.0);
             let height = left.1 + t * (right.1 - left.1);
-            found.push((((i - first[0]) * TILE + (j - first[1])) as u32, height, step));
+            found.push(Found { row: ((i - first[0]) * TILE + (j - first[1])) as u32, step, height });
         }
     }
 }
@@ -160,7 +202,7 @@ fn point_at(lower: DVec3, upper: DVec3, y: f64) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::grid::offset_to_local;
+    use crate::grid::{leaf_offset, offset_to_local};
     use crate::mesh::TriangleMesh;
     use crate::mesh::testing::*;
 
@@ -176,7 +218,7 @@ mod tests {
     fn faces_edges_and_corners_on_voxels_are_counted_once() {
         // Every face, edge and corner of this cube lies on voxels.
         let cube = crossings(&cube(DVec3::splat(-3.0), 8.0));
-        assert_eq!(cube.overlaps(), 0);
+        assert!(cube.overlaps().is_empty());
         let count = (-8..8).flat_map(|x| (-8..8).flat_map(move |y| (-8..8).map(move |z| IVec3::new(x, y, z))));
         // Half-open: each of the 8 unit intervals of an axis holds one voxel.
         assert_eq!(count.filter(|&ijk| inside(&cube, ijk)).count(), 512);
@@ -208,11 +250,11 @@ mod tests {
     fn overlaps_and_wrong_sides_are_noticed_cavities_are_not() {
         let a = cube(DVec3::splat(0.5), 6.0);
         let overlapping = crossings(&joined(a.clone(), &cube(DVec3::splat(2.5), 9.0)));
-        assert!(overlapping.overlaps() > 0 && inside(&overlapping, IVec3::splat(4)));
-        assert!(crossings(&reversed(a.clone())).overlaps() > 0);
+        assert!(!overlapping.overlaps().is_empty() && inside(&overlapping, IVec3::splat(4)));
+        assert!(!crossings(&reversed(a.clone())).overlaps().is_empty());
         let hollow = crossings(&joined(a.clone(), &reversed(cube(DVec3::splat(2.5), 2.0))));
-        assert!(hollow.overlaps() == 0 && !inside(&hollow, IVec3::splat(4)) && inside(&hollow, IVec3::splat(2)));
+        assert!(hollow.overlaps().is_empty() && !inside(&hollow, IVec3::splat(4)) && inside(&hollow, IVec3::splat(2)));
         // Shells that touch in a plane are no overlap.
-        assert_eq!(crossings(&joined(a, &cube(DVec3::new(0.5, 0.5, 6.5), 6.0))).overlaps(), 0);
+        assert!(crossings(&joined(a, &cube(DVec3::new(0.5, 0.5, 6.5), 6.0))).overlaps().is_empty());
     }
 }

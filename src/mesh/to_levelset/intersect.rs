@@ -9,13 +9,17 @@ use crate::mesh::Bvh;
 const TOUCH: f64 = 1e-3;
 
 /// Marks the triangles that another one crosses, overlaps or touches otherwise than at the vertices that they share.
-/// `bvh` holds the triangles of the indexed mesh in its order. Neighbours over an edge are not looked at.
-pub(super) fn intersecting(bvh: &Bvh, positions: &[DVec3], triangles: &[[u32; 3]]) -> Vec<bool> {
+/// Only those with a mark in `asked` are looked at. `bvh` holds the triangles of the indexed mesh in its order. Neighbours over
+/// an edge are not looked at.
+pub(super) fn intersecting(bvh: &Bvh, positions: &[DVec3], triangles: &[[u32; 3]], asked: &[bool]) -> Vec<bool> {
     let corners = |t: u32| triangles[t as usize].map(|v| positions[v as usize]);
     (0..triangles.len() as u32)
         .into_par_iter()
         .with_min_len(256)
         .map(|t| {
+            if !asked[t as usize] {
+                return false;
+            }
             let own = corners(t);
             let (lo, hi) = (own[0].min(own[1]).min(own[2]) - TOUCH, own[0].max(own[1]).max(own[2]) + TOUCH);
             bvh.any_in_box(lo, hi, |other| {
@@ -33,16 +37,27 @@ pub(super) fn intersecting(bvh: &Bvh, positions: &[DVec3], triangles: &[[u32; 3]
                                 triangles[a as usize].iter().filter(|v| !common(v)).map(|&v| positions[v as usize]);
                             Some([rest.next()?, rest.next()?])
                         };
-                        let meets = |edge: Option<[DVec3; 2]>, triangle: [DVec3; 3]| {
-                            edge.is_some_and(|[a, b]| touch([a, b, b], triangle))
+                        let (Some(own_far), Some(other_far)) = (far_edge(t, other), far_edge(other, t)) else {
+                            return false;
                         };
-                        meets(far_edge(t, other), corners(other)) || meets(far_edge(other, t), own)
+                        let meets = |[a, b]: [DVec3; 2], triangle| touch([a, b, b], triangle);
+                        !bisected(own, own_far, other_far) && (meets(own_far, corners(other)) || meets(other_far, own))
                     }
                     _ => false,
                 }
             })
         })
         .collect()
+}
+
+/// Whether the plane through the vertex that two triangles share, square to the difference of the directions in which they
+/// lie, has their other vertices well on either side. It has, for most neighbours on a surface.
+fn bisected(own: [DVec3; 3], own_far: [DVec3; 2], other_far: [DVec3; 2]) -> bool {
+    let shared = own[0] + own[1] + own[2] - own_far[0] - own_far[1];
+    let direction = |far: [DVec3; 2]| (far[0] + far[1] - 2.0 * shared).normalize_or_zero();
+    let axis = direction(own_far) - direction(other_far);
+    let margin = TOUCH * axis.length();
+    own_far.iter().all(|p| axis.dot(*p - shared) > margin) && other_far.iter().all(|p| axis.dot(*p - shared) < -margin)
 }
 
 /// Whether two triangles, which may be segments, come within [`TOUCH`] of each other: no axis separates them, neither a
@@ -73,7 +88,8 @@ mod tests {
 
     fn count(mesh: &TriangleMesh) -> usize {
         let bvh = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect());
-        intersecting(&bvh, &mesh.positions, &mesh.triangles).iter().filter(|&&i| i).count()
+        let asked = vec![true; mesh.triangles.len()];
+        intersecting(&bvh, &mesh.positions, &mesh.triangles, &asked).iter().filter(|&&i| i).count()
     }
 
     #[test]

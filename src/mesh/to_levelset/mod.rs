@@ -13,23 +13,29 @@ mod crossings;
 mod inside;
 mod intersect;
 mod pieces;
+mod rim;
 
-use glam::DVec3;
+use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
+use glam::{DVec3, IVec3};
 use rayon::prelude::*;
+use rustc_hash::FxHashSet;
 
 use closure::{DistanceLeaves, Surroundings};
 use crossings::Crossings;
-use inside::{Inside, OpenInside, Rim};
+use inside::{Inside, caps};
 use pieces::separating_pieces;
+use rim::Rim;
 
+use super::bins::Bins;
 use super::prepare::prepare;
-use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes};
+use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes, leaves_near_triangles, tiles_near};
 use super::topology::{boundary_chain, edge_uses};
-use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber};
+use super::{Bvh, MeshFindings, TriangleMesh};
 use crate::error::{EditError, Result};
-use crate::grid::{LeafMask, LeafValues, MAX_COORD, Transform, VOXEL_SIZES};
-use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, background, grid_of_leaves};
+use crate::grid::{LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, MAX_COORD, Transform, VOXEL_SIZES};
+use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, background, grid_of_parts};
 use crate::run::RunOptions;
+use crate::stencil::simd::{Lanes, Work, dispatch};
 
 const OPERATION: &str = "mesh to level set";
 /// The narrowest band, in voxels, that has both neighbours of every sign change in it, and room for a gradient.
@@ -94,91 +100,143 @@ pub fn mesh_to_level_set(
 
     let corners = |t: usize| clean.corners(t);
     let count = clean.triangles.len();
-    let closed = boundary_chain(&edge_uses(&clean.triangles)).is_empty();
-    let crossings = closed.then(|| Crossings::new(count, corners));
-    findings.self_intersecting = crossings.as_ref().is_some_and(|c| c.overlaps() > 0 || overlaps_sideways(&clean));
+    let chain = match findings.converted.closed {
+        true => Vec::new(),
+        false => boundary_chain(&edge_uses(&clean.triangles)),
+    };
+    let caps = caps(&clean.positions, &chain);
+    // The crossings of a closed surface.
+    let with_caps = |t: usize| caps.get(t.wrapping_sub(count)).copied().unwrap_or_else(|| corners(t));
+    let crossings = Crossings::new(count + caps.len(), with_caps);
+    run.check(OPERATION)?;
+    let mut overlaps = crossings.overlaps().to_vec();
+    overlaps.extend(overlaps_sideways(count + caps.len(), with_caps));
+    run.check(OPERATION)?;
+    let closed = chain.is_empty();
+    findings.self_intersecting = closed && !overlaps.is_empty();
     if params.strict && !findings.is_sound() {
         return Err(EditError::input("mesh", format!("refused (strict): {}", findings.warnings().join("; "))));
     }
-    let distances = distance_to_triangles(count, corners, params.half_width, run)?;
     let transform = Transform::uniform(params.voxel_size);
-    let leaves = match crossings {
-        Some(crossings) if !findings.self_intersecting => {
-            sign(distances, &transform, params.half_width, |origin| crossings.inside(origin))
-        }
-        crossings => repair(&clean, distances, crossings, params, &mut findings, run)?,
+    let background = background(params.half_width, &transform);
+    let leaves = if closed && overlaps.is_empty() {
+        leaves_near_triangles(count, corners, params.half_width, run, |origin, distance| {
+            signed(origin, distance, &crossings.inside(origin), params)
+        })?
+    } else {
+        let caps = Bvh::new(caps);
+        let rim = Rim::new(&clean.positions, &chain);
+        let doubts = Doubts { inside: Inside::new(crossings, &caps, &rim), overlaps, rim: &rim };
+        vec![repair(&clean, &doubts, params, &mut findings, run)?]
     };
-    let level_set = LevelSet::new(grid_of_leaves(background(params.half_width, &transform), leaves), transform);
+    let level_set = LevelSet::new(grid_of_parts(background, &leaves), transform);
     if !encloses_a_voxel(&level_set) {
         return Err(encloses_nothing(closed, &findings, params));
     }
     Ok((level_set, findings))
 }
 
+/// What is known of a surface that overlaps itself or is open.
+struct Doubts<'a> {
+    inside: Inside<'a>,
+    /// Leaves where it overlaps itself.
+    overlaps: Vec<IVec3>,
+    rim: &'a Rim,
+}
+
+impl Doubts<'_> {
+    /// Marks the triangles near which the winding number may be other than 0 on one side and 1 on the other.
+    fn triangles(&self, mesh: &TriangleMesh) -> Vec<bool> {
+        let around = (0..27).map(|i| IVec3::new(i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1) * LEAF_DIM);
+        let overlaps: FxHashSet<IVec3> =
+            around.flat_map(|step| self.overlaps.iter().map(move |origin| *origin + step)).collect();
+        let bins = Bins::new(mesh.triangles.len(), |t, leaves| tiles_near(leaves, mesh.corners(t), 1.0, LEAF_DIM));
+        let doubtful = |bin: &usize| {
+            let origin = IVec3::from_array(*bins.key(*bin)) * LEAF_DIM;
+            overlaps.contains(&origin) || !self.inside.is_integer(origin, LEAF_DIM + 1)
+        };
+        let mut marks = vec![false; mesh.triangles.len()];
+        let leaves: Vec<usize> = (0..bins.len()).into_par_iter().filter(doubtful).collect();
+        leaves.into_iter().flat_map(|bin| bins.items(bin)).for_each(|&t| marks[t as usize] = true);
+        marks
+    }
+}
+
 /// Signed leaves of a surface that overlaps itself or is open.
 fn repair(
     clean: &TriangleMesh,
-    distances: Vec<UnsignedLeaf>,
-    crossings: Option<Crossings>,
+    doubts: &Doubts<'_>,
     params: &MeshToLevelSet,
     findings: &mut MeshFindings,
     run: &RunOptions,
 ) -> Result<Vec<SignedLeaf>> {
     let half_width = params.half_width;
-    let bvh = Bvh::new((0..clean.triangles.len()).map(|t| clean.corners(t)).collect());
-    let winding = WindingNumber::new(&bvh);
-    let rim = Rim::new(&clean.positions, &clean.triangles);
-    let inside = match crossings {
-        Some(crossings) => Inside::Closed(crossings),
-        None => Inside::Open(OpenInside { winding: &winding, rim: &rim }),
-    };
+    let doubtful = doubts.triangles(clean);
     run.check(OPERATION)?;
-    let pieces = separating_pieces(&clean.positions, &clean.triangles, &bvh, &winding, &rim, run)?;
+    let pieces = separating_pieces(&clean.positions, &clean.triangles, &doubtful, doubts.rim, run)?;
     findings.removed_area_fraction = pieces.removed_area_fraction;
     run.check(OPERATION)?;
-    let all = DistanceLeaves::new(distances);
-    let kept = if pieces.removed_area_fraction > 0.0 {
-        distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?
+    let mut kept = DistanceLeaves::new(distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?);
+    // The surface may go on where triangles were left out.
+    let suspects: Vec<IVec3> = if pieces.removed_area_fraction > 0.0 {
+        let marked: Vec<usize> = (0..doubtful.len()).filter(|&t| doubtful[t]).collect();
+        let bins = Bins::new(marked.len(), |i, leaves| tiles_near(leaves, clean.corners(marked[i]), 1.0, LEAF_DIM));
+        (0..bins.len()).map(|bin| IVec3::from_array(*bins.key(bin)) * LEAF_DIM).collect()
     } else {
-        all.leaves().to_vec()
+        Vec::new()
     };
-    let mut kept = DistanceLeaves::new(kept);
-    let mut surroundings = Surroundings::new(&inside, &winding, &all);
-    let closure = surroundings.close(&kept, half_width, run)?;
+    let mut surroundings = Surroundings::new(&doubts.inside);
+    let closure = surroundings.close(&kept, &suspects, half_width, run)?;
     findings.closure_triangles = closure.len();
     kept.merge(distance_to_triangles(closure.len(), |t| closure[t], half_width, run)?);
     let unsigned: Vec<_> = kept.origins().filter(|o| surroundings.mask(*o).is_none()).collect();
     surroundings.extend(&unsigned);
-    let mask = |origin| surroundings.mask(origin).copied().unwrap_or_default();
-    Ok(sign(kept.into_leaves(), &Transform::uniform(params.voxel_size), half_width, mask))
+    let signed = |leaf: &UnsignedLeaf| {
+        signed(leaf.origin, &leaf.distance, &surroundings.mask(leaf.origin).copied().unwrap_or_default(), params)
+    };
+    Ok(kept.leaves().par_iter().filter_map(signed).collect())
 }
 
 /// Values and mask of a leaf at its origin.
-type SignedLeaf = (glam::IVec3, LeafValues, LeafMask);
+type SignedLeaf = (IVec3, LeafValues, LeafMask);
 
-/// World-space signed distances and active masks from distances in voxels and the inside of each leaf.
-fn sign(
-    leaves: Vec<UnsignedLeaf>,
-    transform: &Transform,
+/// World-space signed distances and active mask from distances in voxels and the inside of a leaf; `None` where none is in
+/// the band.
+fn signed(origin: IVec3, distance: &LeafValues, inside: &LeafMask, params: &MeshToLevelSet) -> Option<SignedLeaf> {
+    let mut leaf = (origin, LeafValues::default(), LeafMask::EMPTY);
+    let (_, values, active) = &mut leaf;
+    let &MeshToLevelSet { voxel_size, half_width, .. } = params;
+    let background = background(half_width, &Transform::uniform(voxel_size));
+    dispatch(Sign { distance, inside, voxel_size: voxel_size as f32, half_width, background, values, active });
+    (!leaf.2.is_empty()).then_some(leaf)
+}
+
+/// Scales distances, cuts them at the background and gives them their signs.
+struct Sign<'a> {
+    distance: &'a LeafValues,
+    inside: &'a LeafMask,
+    voxel_size: f32,
     half_width: f32,
-    inside: impl Fn(glam::IVec3) -> LeafMask + Sync,
-) -> Vec<SignedLeaf> {
-    let scale = transform.voxel_size();
-    let background = background(half_width, transform);
-    leaves
-        .into_par_iter()
-        .filter_map(|UnsignedLeaf { origin, distance: mut values }| {
-            let inside = inside(origin);
-            let mut active = LeafMask::EMPTY;
-            for (offset, value) in values.0.iter_mut().enumerate() {
-                let distance = (f64::from(*value) * scale) as f32;
-                active.set(offset, distance < background);
-                let magnitude = if distance < background { distance } else { background };
-                *value = if inside.get(offset) { -magnitude } else { magnitude };
-            }
-            (!active.is_empty()).then_some((origin, values, active))
-        })
-        .collect()
+    background: f32,
+    values: &'a mut LeafValues,
+    active: &'a mut LeafMask,
+}
+
+impl Work for Sign<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        for at in (0..LEAF_VOXELS).step_by(16) {
+            let (word, shift) = (at / 64, at % 64);
+            let distance = Lanes::from_slice(simd, &self.distance.0[at..at + 16]);
+            let phi = distance * self.voxel_size;
+            // Either alone would not do: the background is rounded otherwise than products with the voxel size.
+            let active = distance.simd_lt(self.half_width) & phi.simd_lt(self.background);
+            self.active.0[word] |= active.to_bitmask() << shift;
+            let magnitude = active.select(phi, Lanes::splat(simd, self.background));
+            let inside = mask32x16::from_bitmask(simd, self.inside.0[word] >> shift & 0xffff);
+            inside.select(-magnitude, magnitude).store_slice(&mut self.values.0[at..at + 16]);
+        }
+    }
 }
 
 /// Refuses indices out of range and positions that are no numbers.
@@ -241,13 +299,14 @@ fn reserve(mesh: &TriangleMesh, params: &MeshToLevelSet, run: &RunOptions) -> Re
     run.reserve(OPERATION, needed, "take a larger voxel_size")
 }
 
-/// Whether rows along x or y find an overlap that rows along z have missed, being thin and upright.
-fn overlaps_sideways(mesh: &TriangleMesh) -> bool {
-    let turned = |t: usize, turn: fn(DVec3) -> DVec3| mesh.corners(t).map(turn);
-    let count = mesh.triangles.len();
+/// Leaves where rows along x or y find overlaps, which rows along z miss in what is thin and upright.
+fn overlaps_sideways(count: usize, triangle: impl Fn(usize) -> [DVec3; 3] + Sync) -> Vec<IVec3> {
     // Cyclic permutations keep the orientation.
-    Crossings::new(count, |t| turned(t, |p| DVec3::new(p.y, p.z, p.x))).overlaps() > 0
-        || Crossings::new(count, |t| turned(t, |p| DVec3::new(p.z, p.x, p.y))).overlaps() > 0
+    let along_x = Crossings::new(count, |t| triangle(t).map(|p| DVec3::new(p.y, p.z, p.x)));
+    let along_y = Crossings::new(count, |t| triangle(t).map(|p| DVec3::new(p.z, p.x, p.y)));
+    let back_x = along_x.overlaps().iter().map(|o| IVec3::new(o.z, o.x, o.y));
+    let back_y = along_y.overlaps().iter().map(|o| IVec3::new(o.y, o.z, o.x));
+    back_x.chain(back_y).collect()
 }
 
 fn encloses_a_voxel(level_set: &LevelSet) -> bool {

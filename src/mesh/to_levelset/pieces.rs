@@ -11,8 +11,8 @@ use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::inside::{Rim, WINDING_ERROR};
 use super::intersect::intersecting;
+use super::rim::{Rim, WINDING_ERROR};
 use crate::error::Result;
 use crate::mesh::topology::{by_edge, edge_uses};
 use crate::mesh::winding::BATCH;
@@ -36,7 +36,7 @@ const BESIDE_EACH_OTHER: f64 = 0.75;
 /// is everywhere, as in a heap of triangles, its exact place means nothing.
 const GROWTH: usize = 2;
 /// Up to this many pieces cost too little for that to matter.
-const FEW: usize = 1 << 17;
+const FEW: usize = 1 << 15;
 
 /// What remains of a surface.
 pub(super) struct Pieces {
@@ -76,12 +76,11 @@ impl Piece {
     }
 }
 
-/// Cuts and judges the triangles of an indexed mesh in index space.
+/// Cuts and judges the triangles of an indexed mesh in index space that have a mark in `doubtful`; the others are known to count.
 pub(super) fn separating_pieces(
     positions: &[DVec3],
     triangles: &[[u32; 3]],
-    bvh: &Bvh,
-    winding: &WindingNumber<'_>,
+    doubtful: &[bool],
     rim: &Rim,
     run: &RunOptions,
 ) -> Result<Pieces> {
@@ -89,9 +88,12 @@ pub(super) fn separating_pieces(
     let total: f64 = (0..triangles.len() as u32).map(|t| area(&whole(t).corners)).sum();
     let mut removed = 0.0;
     let mut kept = Vec::new();
+    let bvh = &Bvh::new((0..triangles.len() as u32).map(|t| whole(t).corners).collect());
+    let winding = &WindingNumber::new(bvh);
     // In the order of the tree, so that those judged together lie together.
-    let crossed = intersecting(bvh, positions, triangles);
-    let verdicts = verdicts_together(&whole, triangles, &crossed, winding, rim);
+    let crossed = intersecting(bvh, positions, triangles, doubtful);
+    let sure = doubtful.iter().map(|doubtful| (!doubtful).then_some(true)).collect();
+    let verdicts = verdicts_together(&whole, triangles, sure, &crossed, winding, rim);
     let mut open = Vec::new();
     for piece in bvh.order().into_iter().map(whole) {
         match verdicts[piece.triangle as usize] {
@@ -134,10 +136,11 @@ pub(super) fn separating_pieces(
     Ok(Pieces { kept, removed_area_fraction: if total > 0.0 { removed / total } else { 0.0 } })
 }
 
-/// Whether triangles that no others touch count; `None` for the others, and where one point does not decide.
+/// Completes the `verdicts` whether triangles count for those that no others touch, unless one point does not decide.
 fn verdicts_together(
     whole: &impl Fn(u32) -> Piece,
     triangles: &[[u32; 3]],
+    mut verdicts: Vec<Option<bool>>,
     crossed: &[bool],
     winding: &WindingNumber<'_>,
     rim: &Rim,
@@ -157,7 +160,6 @@ fn verdicts_together(
             }
         }
     }
-    let mut verdicts = vec![None; triangles.len()];
     let mut open = Vec::new();
     for seed in 0..triangles.len() as u32 {
         if crossed[seed as usize] || verdicts[seed as usize].is_some() {
@@ -293,19 +295,12 @@ mod tests {
     use super::*;
     use crate::mesh::TriangleMesh;
     use crate::mesh::testing::*;
+    use crate::mesh::topology::boundary_chain;
 
     fn pieces(mesh: &TriangleMesh) -> Pieces {
-        let bvh = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect());
-        let rim = Rim::new(&mesh.positions, &mesh.triangles);
-        separating_pieces(
-            &mesh.positions,
-            &mesh.triangles,
-            &bvh,
-            &WindingNumber::new(&bvh),
-            &rim,
-            &RunOptions::default(),
-        )
-        .unwrap()
+        let rim = Rim::new(&mesh.positions, &boundary_chain(&edge_uses(&mesh.triangles)));
+        let doubtful = vec![true; mesh.triangles.len()];
+        separating_pieces(&mesh.positions, &mesh.triangles, &doubtful, &rim, &RunOptions::default()).unwrap()
     }
 
     #[test]

@@ -56,6 +56,21 @@ fn a_box_is_exact() {
 }
 
 #[test]
+fn what_is_beyond_the_band_is_inactive_at_any_voxel_size() {
+    let mut open = sphere(DVec3::splat(0.013), 1.0, 20);
+    open.triangles.truncate(open.triangles.len() - 20);
+    for mesh in [sphere(DVec3::splat(0.013), 1.0, 20), open] {
+        for i in 0..12 {
+            let (level_set, _) = convert(&mesh, 0.05 + 0.0037 * f64::from(i)).unwrap();
+            let grid = level_set.grid();
+            // Two bands of three voxels do not fill eight voxels of a leaf but for a corner of the surface.
+            let full = grid.leaves().iter().filter(|&&id| grid.mask(id) == LeafMask::FULL).count();
+            assert!(10 * full < grid.leaves().len(), "{full} of {}", grid.leaves().len());
+        }
+    }
+}
+
+#[test]
 fn a_torus_of_triangles_is_exact_to_its_triangles() {
     let Some(mesh) = shared_mesh("meshes/torus.obj") else { return };
     let (level_set, findings) = convert(&mesh, 0.02).unwrap();
