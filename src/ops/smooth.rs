@@ -136,8 +136,7 @@ impl SpeedFunction for MeanCurvatureFlow {
 
     #[inline(always)]
     fn rate<S: Simd>(&self, simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
-        let at = mean_curvature(simd, halo, x, y, voxel_size);
-        -at.mean * at.gradient
+        -mean_curvature(simd, halo, x, y, voxel_size).motion
     }
 }
 

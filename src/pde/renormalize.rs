@@ -110,12 +110,14 @@ impl LeafKernel for FirstOrder {
         out: &mut LeafValues,
     ) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
+        // A copy, so that what depends on it alone is computed once a leaf.
+        let step = self.0;
         rows.for_each_pair(
             #[inline(always)]
             |x, y, _| {
                 let at = x * 64 + y * 8;
                 let phi = halo.centre(simd, x, y);
-                self.0.euler(simd, phi, godunov_first(simd, halo, x, y, phi)).store_slice(&mut out.0[at..at + 16]);
+                step.euler(simd, phi, godunov_first(simd, halo, x, y, phi)).store_slice(&mut out.0[at..at + 16]);
             },
         );
     }
@@ -141,13 +143,13 @@ impl LeafKernel for Weno5 {
         out: &mut LeafValues,
     ) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
+        let Self(step, epsilon) = *self;
         rows.for_each_pair(
             #[inline(always)]
             |x, y, _| {
                 let at = x * 64 + y * 8;
                 let phi = halo.centre(simd, x, y);
-                self.0
-                    .euler(simd, phi, godunov_weno5(simd, halo, x, y, phi, self.0.voxel_size, self.1))
+                step.euler(simd, phi, godunov_weno5(simd, halo, x, y, phi, step.voxel_size, epsilon))
                     .store_slice(&mut out.0[at..at + 16]);
             },
         );

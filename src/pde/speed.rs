@@ -47,12 +47,14 @@ impl<F: SpeedFunction> LeafKernel for FlowStep<'_, F> {
         out: &mut LeafValues,
     ) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
+        // Copies, so that what depends on them alone is computed once a leaf.
+        let (dt, voxel_size) = (self.dt, self.voxel_size);
         rows.for_each_pair(
             #[inline(always)]
             |x, y, _| {
                 let at = x * 64 + y * 8;
-                let rate = self.function.rate(simd, halo, x, y, self.voxel_size);
-                (halo.centre(simd, x, y) - rate * self.dt).store_slice(&mut out.0[at..at + 16]);
+                let rate = self.function.rate(simd, halo, x, y, voxel_size);
+                (halo.centre(simd, x, y) - rate * dt).store_slice(&mut out.0[at..at + 16]);
             },
         );
     }

@@ -21,6 +21,8 @@ pub struct MeanCurvature<S: Simd> {
     pub mean: Lanes<S>,
     /// |∇φ| by central differences, dimensionless.
     pub gradient: Lanes<S>,
+    /// H|∇φ| in 1/world, without a root.
+    pub motion: Lanes<S>,
 }
 
 /// H (1/world) and central |∇φ| of rows (x, y) and (x, y + 1).
@@ -47,7 +49,13 @@ pub fn mean_curvature<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, voxel_s
     let curved = norm2.simd_gt(FLAT_SQUARED * voxel_size * voxel_size);
     // One quotient: |Dφ|³ dx is at most the fourth power of a voxel size, which f32 holds from 1e-9 to 1e9.
     let mean = alpha / (norm2 * norm * (2.0 * voxel_size));
-    MeanCurvature { mean: curved.select(mean, Lanes::splat(simd, 0.0)), gradient: norm * (1.0 / voxel_size) }
+    let motion = alpha / (norm2 * (2.0 * voxel_size * voxel_size));
+    let zero = Lanes::splat(simd, 0.0);
+    MeanCurvature {
+        mean: curved.select(mean, zero),
+        gradient: norm * (1.0 / voxel_size),
+        motion: curved.select(motion, zero),
+    }
 }
 
 /// Laplacian: Δφ in 1/world.
