@@ -114,6 +114,7 @@ halo_stencil!(Weno5, godunov_weno5_, StarHalo, |simd, halo, x, y, h| godunov_wen
     halo,
     x,
     y,
+    u16::MAX,
     halo.centre(simd, x, y),
     h,
     WenoEpsilon::SCALE_FREE

@@ -294,11 +294,11 @@ impl LeafKernel for Weno5<'_> {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         rows.for_each_pair(
             #[inline(always)]
-            |x, y, _| {
+            |x, y, bits| {
                 let at = x * 64 + y * 8;
                 let (phi, speed) = (halo.centre(simd, x, y), self.0.speed(simd, id, x, y));
                 let direction = self.0.direction(phi, speed);
-                let norm2 = godunov_weno5(simd, halo, x, y, direction, self.0.voxel_size, self.1);
+                let norm2 = godunov_weno5(simd, halo, x, y, bits, direction, self.0.voxel_size, self.1);
                 self.0.euler(phi, speed, norm2).store_slice(&mut out.0[at..at + 16]);
             },
         );

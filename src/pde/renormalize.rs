@@ -146,10 +146,10 @@ impl LeafKernel for Weno5 {
         let Self(step, epsilon) = *self;
         rows.for_each_pair(
             #[inline(always)]
-            |x, y, _| {
+            |x, y, bits| {
                 let at = x * 64 + y * 8;
                 let phi = halo.centre(simd, x, y);
-                step.euler(simd, phi, godunov_weno5(simd, halo, x, y, phi, step.voxel_size, epsilon))
+                step.euler(simd, phi, godunov_weno5(simd, halo, x, y, bits, phi, step.voxel_size, epsilon))
                     .store_slice(&mut out.0[at..at + 16]);
             },
         );
