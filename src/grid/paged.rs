@@ -263,6 +263,13 @@ impl PageLeaves {
         })
     }
 
+    /// The leaf after `id`, in slot order.
+    #[inline(always)]
+    pub fn after(self, id: LeafId) -> Option<LeafId> {
+        let rest = self.word & (!1 << id.slot());
+        (rest != 0).then(|| LeafId::new(self.page * PAGE_LEAVES + rest.trailing_zeros() as usize))
+    }
+
     /// Calls `f` with each leaf, in slot order.
     #[inline(always)]
     pub fn for_each(self, mut f: impl FnMut(LeafId)) {

@@ -144,6 +144,8 @@ struct BoxMean {
 }
 
 impl LeafKernel for BoxMean {
+    const REACH: usize = 1;
+
     type Scratch = (Cube, SlabScratch);
 
     fn scratch(&self) -> Self::Scratch {
@@ -170,6 +172,8 @@ struct BoxMedian {
 }
 
 impl LeafKernel for BoxMedian {
+    const REACH: usize = 1;
+
     type Scratch = (Cube, MedianScratch);
 
     fn scratch(&self) -> Self::Scratch {
@@ -195,6 +199,8 @@ impl LeafKernel for BoxMedian {
 struct Subtract(f32);
 
 impl LeafKernel for Subtract {
+    const REACH: usize = 0;
+
     type Scratch = ();
 
     fn scratch(&self) {}

@@ -25,7 +25,7 @@ use crate::region::Region;
 use crate::run::RunOptions;
 use crate::stencil::simd::{Lanes, Work, dispatch};
 use crate::stencil::upwind::{UpwindScheme, WenoEpsilon, godunov_first, godunov_weno5};
-use crate::stencil::{FaceHalo, StarHalo};
+use crate::stencil::{FaceHalo, LeafHalo, StarHalo};
 
 /// The product that approximates F|∇φ|.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -243,6 +243,8 @@ impl MorphStep<'_> {
 struct FirstOrder<'a>(MorphStep<'a>);
 
 impl LeafKernel for FirstOrder<'_> {
+    const REACH: usize = FaceHalo::REACH;
+
     type Scratch = FaceHalo;
 
     fn scratch(&self) -> FaceHalo {
@@ -275,6 +277,8 @@ impl LeafKernel for FirstOrder<'_> {
 struct Weno5<'a>(MorphStep<'a>, WenoEpsilon);
 
 impl LeafKernel for Weno5<'_> {
+    const REACH: usize = <StarHalo as LeafHalo>::REACH;
+
     type Scratch = StarHalo;
 
     fn scratch(&self) -> StarHalo {

@@ -16,7 +16,7 @@ use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 use crate::stencil::simd::Lanes;
 use crate::stencil::upwind::{UpwindScheme, WenoEpsilon, godunov_first, godunov_weno5};
-use crate::stencil::{FaceHalo, StarHalo};
+use crate::stencil::{FaceHalo, LeafHalo, StarHalo};
 
 /// Renormalises the whole band `solver.normalizations` times. The band itself stays as it is.
 pub fn renormalize(level_set: &mut LevelSet, solver: &SolverOptions, run: &RunOptions) -> Result<()> {
@@ -63,6 +63,8 @@ impl Tracker<'_> {
 struct Unchanged;
 
 impl LeafKernel for Unchanged {
+    const REACH: usize = 0;
+
     type Scratch = ();
 
     fn scratch(&self) {}
@@ -93,6 +95,8 @@ impl RenormalizationStep {
 struct FirstOrder(RenormalizationStep);
 
 impl LeafKernel for FirstOrder {
+    const REACH: usize = FaceHalo::REACH;
+
     type Scratch = FaceHalo;
 
     fn scratch(&self) -> FaceHalo {
@@ -126,6 +130,8 @@ impl LeafKernel for FirstOrder {
 struct Weno5(RenormalizationStep, WenoEpsilon);
 
 impl LeafKernel for Weno5 {
+    const REACH: usize = <StarHalo as LeafHalo>::REACH;
+
     type Scratch = StarHalo;
 
     fn scratch(&self) -> StarHalo {

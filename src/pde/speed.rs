@@ -30,6 +30,8 @@ pub(super) struct FlowStep<'a, F> {
 }
 
 impl<F: SpeedFunction> LeafKernel for FlowStep<'_, F> {
+    const REACH: usize = F::Halo::REACH;
+
     type Scratch = F::Halo;
 
     fn scratch(&self) -> F::Halo {

@@ -6,11 +6,14 @@ use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
 
 use super::domain::Domain;
 use super::tracker::Tracker;
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged};
+use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged, prefetch_faces};
 use crate::stencil::simd::{self, Lanes, Work};
 
 /// One explicit Euler step on a leaf.
 pub(super) trait LeafKernel: Sync {
+    /// Voxels beyond a leaf that it reads along the axes.
+    const REACH: usize;
+
     /// Buffers that a task reuses from leaf to leaf.
     type Scratch;
 
@@ -145,10 +148,13 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
         let mut scratch = self.kernel.scratch();
         let mut new = LeafValues::default();
         let background = Lanes::splat(simd, self.grid.background());
-        let several = self.several_buffers;
+        let (several, neighbours) = (self.several_buffers, self.grid.neighbours());
         self.leaves.for_each(
             #[inline(always)]
             |id| {
+                if let Some(next) = self.leaves.after(id) {
+                    prefetch_faces(self.grid.value_pages(), &neighbours[next.index()], K::REACH);
+                }
                 let out = &mut self.page[PageLeaves::slot(id)];
                 let phi = self.grid.values(id);
                 let mut mask = self.masks.as_mut().map(|masks| &mut masks[PageLeaves::slot(id)]);

@@ -14,6 +14,9 @@ pub type Row = [f32; 8];
 
 /// A leaf and the voxels around it that a stencil reads.
 pub trait LeafHalo: Default {
+    /// Voxels beyond the leaf along each axis.
+    const REACH: usize;
+
     /// Copies the leaf in the middle of `around` and what belongs to its rim.
     fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours);
 
@@ -94,6 +97,8 @@ impl Default for Halo {
 }
 
 impl LeafHalo for Halo {
+    const REACH: usize = 1;
+
     #[inline(always)]
     fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
         Self::gather(self, values, around);
@@ -189,6 +194,8 @@ impl StarHalo<3> {
 }
 
 impl<const REACH: usize> LeafHalo for StarHalo<REACH> {
+    const REACH: usize = REACH;
+
     #[inline(always)]
     fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
         Self::gather(self, values, around);

@@ -202,10 +202,13 @@ mod tests {
         impl<F: FnOnce(&mut dyn FnMut([f32; 5], WenoEpsilon) -> f32, &mut dyn FnMut([f32; 3]) -> f32)> Work for Run<F> {
             fn run<S: Simd>(self, simd: S) {
                 let splat = |v: f32| Lanes::splat(simd, v);
-                self.0(&mut |v, e| Weno5::new(e, 1.0).difference(simd, &Side::new(v.map(splat)))[0], &mut |[p, b, a]| {
-                    let sign = mirror(simd, splat(p));
-                    godunov(simd, splat(b) * sign, splat(a) * sign)[0]
-                });
+                self.0(
+                    &mut |v, e| Weno5::new(e, 1.0).difference(simd, &Side::new(v.map(splat)))[0],
+                    &mut |[p, b, a]| {
+                        let sign = mirror(simd, splat(p));
+                        godunov(simd, splat(b) * sign, splat(a) * sign)[0]
+                    },
+                );
             }
         }
         dispatch(Run(f));
