@@ -8,14 +8,19 @@ use super::topology::Neighbours;
 const SLAB: usize = 64;
 const LINE: usize = 16;
 
-/// Asks for the values within `reach` voxels (1 to 8) of a leaf across its faces in x and y, which lie farther away in memory than
-/// the processor foresees. Those across the faces in z are the leaf's neighbours in memory as well.
+/// Asks for what a stencil that reaches `reach` voxels (1 to 8) along the axes will read around a leaf: the values across its faces
+/// in x and y, and all of the leaf above it in z, whose rows begin with what is read. The leaf itself and the one below were read
+/// before as neighbours in z of the leaves below, as leaves mostly come in the order of their origins.
 #[inline(always)]
 pub fn prefetch_faces(values: &Paged<LeafValues>, around: &Neighbours, reach: usize) {
     let (below, above) = (&values.get(around[4]).0, &values.get(around[22]).0);
     for at in (0..reach.min(8) * SLAB).step_by(LINE) {
         prefetch(&below[8 * SLAB - LINE - at]);
         prefetch(&above[at]);
+    }
+    let next = &values.get(around[14]).0;
+    for at in (0..next.len()).step_by(LINE) {
+        prefetch(&next[at]);
     }
     let (below, above) = (&values.get(around[10]).0, &values.get(around[16]).0);
     for slab in (0..8 * SLAB).step_by(SLAB) {
