@@ -105,14 +105,14 @@ pub(super) const CASES: &[Case] = &[
         operator: "level-set-to-mesh",
         scheme: "against volumeToMesh, adaptivity 0; distance of its vertices",
         tolerance: 1.0,
-        contest: |input| Polygonising::new(input),
+        contest: |input| Polygonising::boxed(input),
     },
-    Case { operator: "read", scheme: "blosc, float", tolerance: 0.0, contest: |input| Reading::new(input) },
+    Case { operator: "read", scheme: "blosc, float", tolerance: 0.0, contest: |input| Reading::boxed(input) },
     Case {
         operator: "write",
         scheme: "blosc, float; ours flushed and verified",
         tolerance: 0.0,
-        contest: |input| Writing::new(input),
+        contest: |input| Writing::boxed(input),
     },
 ];
 
