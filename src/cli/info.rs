@@ -95,7 +95,8 @@ impl CurvatureFile {
 
     /// Computes and writes it, and adds it to what is said of the file.
     fn write(self, inputs: &[PathBuf], options: &InputOptions, found: &mut Found, context: &Context) -> Result<()> {
-        let loaded = input::load(inputs, options, &mut found.warnings, context)?;
+        // The grid that the level set was read from is written as well.
+        let loaded = input::load_whole(inputs, options, &mut found.warnings, context)?;
         let Some(input) = loaded.first() else { return Ok(()) };
         let field = curvature(&input.level_set, self.kind, &context.run)?;
         let name = format!("{}_curvature", self.word);

@@ -166,9 +166,31 @@ enum Raw {
 
 /// Reads all inputs. Meshes get voxels of one size, so that they lie on one lattice: that of the options, else that of the
 /// first `.vdb`, else by the resolution over all of them together. What was repaired goes to `warnings`.
+///
+/// Of the grids that they are read from only the place in their files is left, to be taken by a result.
 pub fn load(
     paths: &[PathBuf],
     options: &InputOptions,
+    warnings: &mut Vec<String>,
+    context: &Context,
+) -> Result<Vec<Input>> {
+    load_with(paths, options, Volume::take, warnings, context)
+}
+
+/// As [`load`], for results that go beside the grids that the level sets are read from: files stay whole.
+pub fn load_whole(
+    paths: &[PathBuf],
+    options: &InputOptions,
+    warnings: &mut Vec<String>,
+    context: &Context,
+) -> Result<Vec<Input>> {
+    load_with(paths, options, |volume, choice| volume.read(choice), warnings, context)
+}
+
+fn load_with(
+    paths: &[PathBuf],
+    options: &InputOptions,
+    read: impl Fn(&mut Volume, Choice) -> Result<VolumeGrid>,
     warnings: &mut Vec<String>,
     context: &Context,
 ) -> Result<Vec<Input>> {
@@ -187,7 +209,7 @@ pub fn load(
         if is_volume(path) {
             let mut volume = volume::open(path, &context.run)?;
             warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
-            let grid = volume.take(options.choice(volumes))?;
+            let grid = read(&mut volume, options.choice(volumes))?;
             volumes += 1;
             raw.push(Raw::Volume(Box::new((volume, grid))));
         } else {

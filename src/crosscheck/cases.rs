@@ -105,14 +105,14 @@ pub(super) const CASES: &[Case] = &[
         operator: "level-set-to-mesh",
         scheme: "against volumeToMesh, adaptivity 0; distance of its vertices",
         tolerance: 1.0,
-        contest: |input| Polygonising::new(input),
+        contest: |input| Polygonising::boxed(input),
     },
-    Case { operator: "read", scheme: "blosc, float", tolerance: 0.0, contest: |input| Reading::new(input) },
+    Case { operator: "read", scheme: "blosc, float", tolerance: 0.0, contest: |input| Reading::boxed(input) },
     Case {
         operator: "write",
         scheme: "blosc, float; ours flushed and verified",
         tolerance: 0.0,
-        contest: |input| Writing::new(input),
+        contest: |input| Writing::boxed(input),
     },
 ];
 
@@ -132,7 +132,7 @@ fn same<'a>(
     tracker: Tracker,
 ) -> Sides<'a> {
     let theirs = Operation::in_place(move |grid: &mut ReferenceGrid| grid.apply(filter, &tracker));
-    GridContest::new(input, Judge::Equal, Operation::in_place(ours), theirs)
+    GridContest::boxed(input, Judge::Equal, Operation::in_place(ours), theirs)
 }
 
 /// One step of a smoothing flow, or one application of a filter.
@@ -187,7 +187,7 @@ fn masked_mean_curvature<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let inside = Primitive::DEFAULT_SOFT[0] * radius - 5.0 * transform.voxel_size();
     let counts = move |ijk| transform.voxel_to_world(ijk).distance(centre) < inside;
     let (params, run) = (Smooth { evolution, ..Smooth::default() }, input.run.clone());
-    GridContest::new(
+    GridContest::boxed(
         input,
         Judge::EqualAt(Box::new(counts)),
         Operation::in_place(move |grid| smooth(grid, &params, &run).map(drop)),
@@ -251,7 +251,7 @@ fn whole_track<'a>(input: &'a Input<'a>) -> Sides<'a> {
 
 fn exact_offset<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let (voxel, run) = (input.level_set.voxel_size(), input.run.clone());
-    GridContest::new(
+    GridContest::boxed(
         input,
         Judge::Truth { offset: 1.0 },
         Operation::new(move |grid| offset(grid, voxel, &run)),
@@ -271,13 +271,13 @@ fn morph<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let theirs = move |grid: &mut ReferenceGrid| {
         grid.morph(&reference, 1.0, ReferenceScheme::HjWeno5, 2, &Tracker::default()).map(drop)
     };
-    GridContest::new(input, Judge::Equal, Operation::in_place(ours), Operation::in_place(theirs))
+    GridContest::boxed(input, Judge::Equal, Operation::in_place(ours), Operation::in_place(theirs))
 }
 
 fn csg_union<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let shifted = shifted(input.level_set)?;
     let (reference, run) = (ReferenceGrid::from_level_set(&shifted)?, input.run.clone());
-    GridContest::new(
+    GridContest::boxed(
         input,
         Judge::Equal,
         Operation::new(move |grid| csg(grid, &[&shifted], CsgOperation::Union, &run)),
@@ -287,7 +287,7 @@ fn csg_union<'a>(input: &'a Input<'a>) -> Sides<'a> {
 
 fn exact_rebuild<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let run = input.run.clone();
-    GridContest::new(
+    GridContest::boxed(
         input,
         Judge::Truth { offset: 0.0 },
         Operation::new(move |grid| rebuild(grid, &Rebuild::band(3.0), &run)),
@@ -297,7 +297,7 @@ fn exact_rebuild<'a>(input: &'a Input<'a>) -> Sides<'a> {
 
 fn sweep<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let (half_width, run) = (input.level_set.half_width(), input.run.clone());
-    GridContest::new(
+    GridContest::boxed(
         input,
         Judge::Truth { offset: 0.0 },
         Operation::new(move |grid| sweep_distance(grid, half_width, &run)),
@@ -307,7 +307,7 @@ fn sweep<'a>(input: &'a Input<'a>) -> Sides<'a> {
 
 fn sweep_outwards<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let (half_width, run) = (input.level_set.half_width() + 3.0, input.run.clone());
-    GridContest::new(
+    GridContest::boxed(
         input,
         Judge::Truth { offset: 0.0 },
         Operation::new(move |grid| sweep_distance(grid, half_width, &run)),
@@ -326,7 +326,7 @@ fn from_mesh<'a>(input: &'a Input<'a>) -> Sides<'a> {
     let (params, run) = (MeshToLevelSet { half_width, ..MeshToLevelSet::new(voxel_size) }, input.run.clone());
     let mut in_voxels = mesh.clone();
     in_voxels.positions.iter_mut().for_each(|p| *p /= voxel_size);
-    GridContest::new(
+    GridContest::boxed(
         input,
         Judge::Mesh { mesh: in_voxels, tolerance: FROM_MESH },
         Operation::new(move |_| Ok(mesh_to_level_set(&mesh, &params, &run)?.0)),

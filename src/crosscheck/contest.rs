@@ -24,12 +24,17 @@ pub(super) trait Contest {
     fn difference(&self) -> Result<Difference>;
 }
 
+/// Changes a grid.
+type Change<Grid> = dyn Fn(&mut Grid) -> Result<()>;
+/// Makes a grid of another.
+type Make<Grid> = dyn Fn(&Grid) -> Result<Grid>;
+
 /// What a side does to a grid.
 pub(super) enum Operation<Grid> {
     /// Changes it.
-    InPlace(Box<dyn Fn(&mut Grid) -> Result<()>>),
+    InPlace(Box<Change<Grid>>),
     /// Makes a new one.
-    New(Box<dyn Fn(&Grid) -> Result<Grid>>),
+    New(Box<Make<Grid>>),
 }
 
 impl<Grid> Operation<Grid> {
@@ -80,7 +85,7 @@ pub(super) struct GridContest<'a> {
 
 impl<'a> GridContest<'a> {
     /// A contest on `input`.
-    pub fn new(
+    pub fn boxed(
         input: &'a Input<'a>,
         judge: Judge,
         ours: Operation<LevelSet>,

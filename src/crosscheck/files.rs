@@ -40,7 +40,7 @@ pub(super) struct Reading<'a> {
 }
 
 impl<'a> Reading<'a> {
-    pub fn new(input: &'a Input<'a>) -> Result<Box<dyn Contest + 'a>> {
+    pub fn boxed(input: &'a Input<'a>) -> Result<Box<dyn Contest + 'a>> {
         let files = Files::new()?;
         ReferenceGrid::from_level_set(input.level_set)?.write(&files.ours)?;
         Ok(Box::new(Self { input, files, ours: None, theirs: None }))
@@ -81,7 +81,7 @@ pub(super) struct Writing<'a> {
 }
 
 impl<'a> Writing<'a> {
-    pub fn new(input: &'a Input<'a>) -> Result<Box<dyn Contest + 'a>> {
+    pub fn boxed(input: &'a Input<'a>) -> Result<Box<dyn Contest + 'a>> {
         let reference = ReferenceGrid::from_level_set(input.level_set)?;
         Ok(Box::new(Self { input, files: Files::new()?, reference }))
     }

@@ -18,7 +18,7 @@ pub(super) struct Polygonising<'a> {
 }
 
 impl<'a> Polygonising<'a> {
-    pub fn new(input: &'a Input<'a>) -> Result<Box<dyn Contest + 'a>> {
+    pub fn boxed(input: &'a Input<'a>) -> Result<Box<dyn Contest + 'a>> {
         let reference = ReferenceGrid::from_level_set(input.level_set)?;
         Ok(Box::new(Self { input, reference, ours: None, theirs: None }))
     }

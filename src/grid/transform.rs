@@ -32,7 +32,8 @@ impl Transform {
     pub fn from_affine(to_world: DAffine3) -> Result<Self, String> {
         let DMat3 { x_axis: x, y_axis: y, z_axis: z } = to_world.matrix3;
         let sizes = [x.length(), y.length(), z.length()];
-        let mean = (sizes[0] + sizes[1] + sizes[2]) / 3.0;
+        // Of three equal sizes it is that size to the last bit: a transform comes back from a file as it was.
+        let mean = sizes[0] + ((sizes[1] - sizes[0]) + (sizes[2] - sizes[0])) / 3.0;
         if !(mean.is_finite() && mean > 0.0 && to_world.translation.is_finite()) {
             return Err("its transform is not invertible".into());
         }
@@ -100,6 +101,10 @@ mod tests {
         let ijk = DVec3::new(-7.25, 100.0, 3.5);
         assert!((transform.world_to_index(transform.index_to_world(ijk)) - ijk).length() < 1e-10);
         assert!((transform.voxel_size() - 0.05).abs() < 1e-15);
+        for size in [0.05, 0.1, 0.7, 1.0 / 3.0] {
+            let uniform = Transform::uniform(size);
+            assert_eq!(Transform::from_affine(uniform.to_world()), Ok(uniform));
+        }
 
         let flat = DAffine3::from_scale(DVec3::new(0.01, 0.02, 0.01));
         assert!(Transform::from_affine(flat).unwrap_err().contains("not cubes"));

@@ -68,7 +68,8 @@ fn project(
         let (aa, ab, bb) = (ga.dot(ga), ga.dot(gb), gb.dot(gb));
         let determinant = aa * bb - ab * ab;
         x -= ga * ((a * bb - b * ab) / determinant) + gb * ((b * aa - a * ab) / determinant);
-        if !(x.distance(voxel) <= FARTHEST) {
+        let moved = x.distance(voxel);
+        if moved.is_nan() || moved > FARTHEST {
             return None;
         }
     }

@@ -93,8 +93,17 @@ impl LevelSet {
     }
 
     /// Half width of the band in voxels, derived from the background.
+    ///
+    /// The quotient is rounded twice and may miss the number that the background was made of by its last bit. So a decimal
+    /// number of few digits that gives the same background is taken instead: what is converted to this width gets the same bits.
     pub fn half_width(&self) -> f32 {
-        (f64::from(self.background()) / self.voxel_size()) as f32
+        const DIGITS: f64 = 1e5;
+        let quotient = f64::from(self.background()) / self.voxel_size();
+        let decimal = ((quotient * DIGITS).round() / DIGITS) as f32;
+        match background(decimal, self.transform()) == self.background() {
+            true => decimal,
+            false => quotient as f32,
+        }
     }
 
     /// Whether there is no surface: no active voxel and no inside.
@@ -133,4 +142,19 @@ fn box_corners(lo: IVec3, hi: IVec3) -> [DVec3; 8] {
             if c & 1 == 0 { lo.z } else { hi.z },
         )
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_half_width_comes_back_to_the_last_bit() {
+        for half_width in [1.5, 2.25, 3.0, 3.7, 10.0, 512.0] {
+            for size in [0.05, 0.1, 0.7, 1.0 / 3.0, 1.0, 1e-9, 7.3e8] {
+                let transform = Transform::uniform(size);
+                assert_eq!(LevelSet::empty(transform, half_width).half_width(), half_width, "{size}");
+            }
+        }
+    }
 }

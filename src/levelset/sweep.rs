@@ -18,7 +18,7 @@ use crate::grid::{Face, Grid, LEAF_DIM, LeafId, LeafMask, LeafSet, LeafValues, P
 use crate::run::RunOptions;
 use crate::stencil::FaceHalo;
 use crate::stencil::eikonal::{extend, seeds, solve, upwind_neighbours};
-use crate::stencil::simd::{Lanes, Work, dispatch};
+use crate::stencil::simd::{Lanes, Work, dispatch, with_sign};
 
 const OPERATION: &str = "sweeping distances";
 
@@ -201,8 +201,7 @@ impl Work for Seed<'_> {
                         let phi = halo.centre(simd, x, y);
                         let found = seeds(simd, &halo, x, y, self.voxel_size);
                         let distance = merge(simd, found.beside, found.distance.max(least).min(far), far);
-                        let inside = phi.simd_lt(Lanes::splat(simd, 0.0));
-                        inside.select(-distance, distance).store_slice(&mut values.0[at..at + 16]);
+                        with_sign(simd, distance, phi).store_slice(&mut values.0[at..at + 16]);
                         mask.0[x] |= u64::from(found.beside) << (y * 8);
                     },
                 );
@@ -244,9 +243,7 @@ impl Work for Round<'_> {
                             return;
                         }
                         let found = solve(simd, neighbours, self.voxel_size).min(old.abs());
-                        // Not `copysign`: selected by a mask, the compiler made wrong code of it for AVX-512.
-                        let signed = old.simd_lt(Lanes::splat(simd, 0.0)).select(-found, found);
-                        let new = merge(simd, free, signed, old);
+                        let new = merge(simd, free, with_sign(simd, found, old), old);
                         any |= new.simd_eq(old).to_bitmask() != 0xffff;
                         new.store_slice(&mut out.0[at..at + 16]);
                     },
@@ -390,10 +387,15 @@ mod tests {
         for half_width in [1.5, 3.0, 10.0] {
             let wide = swept(&ball(centre, 20.0), half_width);
             let (mean, worst) = errors(wide.grid(), |p, v| v - ((p - centre).length() - 20.0));
-            // The error of a curved front grows with the logarithm of the distance.
-            assert!(mean < 0.1 && worst < 0.3, "{half_width}: {mean} {worst}");
-            // All voxels of the band are there, but those within the error of its rim.
+            // One-sided differences err by h/2·u_ii along axis i, which along a ray of direction n makes de/dr = h/2·g/r with
+            // g = Σ|nᵢ|(1 − nᵢ²): at most 2/√3, along the diagonals of space, ¾ on average. So the error is h/2·g times the
+            // logarithm of r/R, largest at the inner rim and half as large on average; and h/R for the voxels that start it.
             let w = f64::from(half_width);
+            let (inner, outer) = ((20.0 / (20.0 - w)).ln(), ((20.0 + w) / 20.0).ln());
+            let seeded = 1.0 / 20.0;
+            assert!(worst < inner / 3f64.sqrt() + seeded, "{half_width}: {worst}");
+            assert!(mean < 0.375 * (inner + outer) / 4.0 + seeded, "{half_width}: {mean}");
+            // All voxels of the band are there, but those within the error of its rim.
             let shell = |w: f64| 4.0 / 3.0 * std::f64::consts::PI * ((20.0 + w).powi(3) - (20.0 - w).powi(3));
             let active = wide.grid().active_voxels() as f64;
             assert!(active > shell(w - 0.3) && active < shell(w + 0.3), "{half_width}: {active}");
@@ -404,16 +406,20 @@ mod tests {
 
     #[test]
     fn planes_are_exact_and_boxes_of_first_order() {
-        // The faces of a box: planes, away from its edges. Outside the edges distances fan out.
+        // The faces of a box: planes, away from its edges. Outside the edges distances fan out. Inside, behind an edge, the
+        // scheme rounds the ridge: where two neighbours are equal, u is short by 1 − 1/√2 of a voxel, and a neighbour that is
+        // short by ε leaves ε²/2 to the next voxel. Four voxels from the ridge, whose depth is that of the band, 4e-7 is left.
         let half = DVec3::new(20.3, 17.6, 14.1);
         let exact = |p: DVec3| box_distance(p, half);
         let wide = swept(&sampled(26, exact), 6.0);
-        let beside_a_face = |p: DVec3| (p.abs() - half).to_array().iter().filter(|d| **d > -7.0).count() == 1;
+        let beside_a_face = |p: DVec3| (p.abs() - half).to_array().iter().filter(|d| **d > -10.0).count() == 1;
         let (_, on_faces) = errors(wide.grid(), |p, v| if beside_a_face(p) { v - exact(p) } else { 0.0 });
         assert!(on_faces < 1e-5, "{on_faces}");
         let (mean, worst) = errors(wide.grid(), |p, v| v - exact(p));
-        // The scheme's error behind an edge: 0.4 voxel at a distance of 6 (h/4·ln of the distance, and more behind a corner).
-        assert!(mean < 0.08 && worst < 0.9, "{mean} {worst}");
+        // Largest behind a corner, where distances fan out from a point: the scheme's recursion in f64 from exact distances along
+        // the faces has 0.71 at the first voxel, which is 1.21 from the corner, and 1.13 where u reaches 6, below the bound
+        // 0.71 + h/√3·ln(4.63/1.21) = 1.48; voxels beside the edges, whose gradients mix two faces, add to it.
+        assert!(mean < 0.08 && worst < 1.25, "{mean} {worst}");
 
         // The large faces of a turned slab, away from its edges: planes in no special position.
         let turn = DQuat::from_scaled_axis(DVec3::new(0.4, 0.7, -0.2));

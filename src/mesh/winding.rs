@@ -321,7 +321,9 @@ fn argument(y: f32, x: f32) -> f32 {
     let series = 0.999_977_26
         + s * (-0.332_623_47 + s * (0.193_543_46 + s * (-0.116_432_87 + s * (0.052_653_32 - s * 0.011_721_2))));
     let angle = a * series;
-    (if y.abs() < x { angle } else { std::f32::consts::FRAC_PI_2 - angle }).copysign(y)
+    let angle = if y.abs() < x { angle } else { std::f32::consts::FRAC_PI_2 - angle };
+    // Not `copysign`: this is made vector code of; see `with_sign` in `stencil::simd`.
+    if y < 0.0 { -angle } else { angle }
 }
 
 /// Adds the solid angles of a few triangles at `middle + offsets`.

@@ -2,12 +2,12 @@
 //!
 //! Masks and regions are handled here and nowhere else.
 
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
+use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 
 use super::domain::Domain;
 use super::tracker::Tracker;
 use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged, prefetch_faces};
-use crate::stencil::simd::{self, Lanes, Work};
+use crate::stencil::simd::{self, Lanes, Work, with_sign};
 
 /// One explicit Euler step on a leaf.
 pub(super) trait LeafKernel: Sync {
@@ -188,7 +188,7 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
                         }
                         if let Some(mask) = &mut mask {
                             let outside = value.abs().simd_ge(background);
-                            value = outside.select(background.copysign(value), value);
+                            value = outside.select(with_sign(simd, background, value), value);
                             let trimmed = outside.to_bitmask() & u64::from(bits);
                             mask.0[x] &= !(trimmed << (8 * y));
                             if mask.0[x] >> (8 * y) & 0xffff == 0

@@ -237,13 +237,15 @@ mod tests {
             Shape::Superellipsoid { radii: DVec3::new(1.0, 1.0, 2.0), exponents: [2.0, 2.0] },
         ] {
             let region = at_origin(shape);
+            // Places in and around the shape, and balls small against it: some lie wholly in the full part, some outside.
+            let (radius, spread) = (0.1, region.shape.extent() * 1.5);
             let at = |i: u32, k: u32| f64::from(i * k % 41) / 20.5 - 1.0;
             let (mut all, mut none) = (0, 0);
             for i in 0..400 {
-                let centre = DVec3::new(at(i, 7), at(i, 11), at(i, 17)) * 3.3;
-                let [low, high] = region.weights_within(centre, 0.3);
+                let centre = DVec3::new(at(i, 7), at(i / 7, 11), at(i / 49, 17)) * spread;
+                let [low, high] = region.weights_within(centre, radius);
                 for k in 0..60 {
-                    let offset = DVec3::new(at(k, 3), at(k, 13), at(k, 19)).normalize_or_zero() * 0.3;
+                    let offset = DVec3::new(at(k, 3), at(k, 13), at(k, 19)).normalize_or_zero() * radius;
                     assert!((low..=high).contains(&region.weight(centre + offset)), "{region:?} {centre}");
                 }
                 (all, none) = (all + u32::from(low == 1.0), none + u32::from(high == 0.0));

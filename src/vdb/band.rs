@@ -6,7 +6,7 @@
 
 use std::fmt;
 
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
+use fearless_simd::{Bytes, Select, Simd, SimdBase, SimdMask, i32x16, mask32x16};
 
 use super::bridge::ffi;
 use crate::grid::{LEAF_VOXELS, LeafMask, LeafValues};
@@ -66,7 +66,7 @@ impl Work for Scan<'_> {
             let v = Lanes::from_slice(simd, values);
             let on = self.mask.0[pair / 4] >> (16 * (pair % 4)) & 0xffff;
             // By the sign bit: a negative zero is inside.
-            let negative = splat(1.0).copysign(v).simd_lt(splat(0.0)).to_bitmask();
+            let negative = v.bitcast::<i32x16<S>>().simd_lt(i32x16::splat(simd, 0)).to_bitmask();
             let sets = [on, !on & negative & 0xffff, !on & !negative & 0xffff];
             for set in 0..3 {
                 let counts = mask32x16::from_bitmask(simd, sets[set]);
