@@ -3,7 +3,7 @@
 //! Kernels work on two rows of a leaf at once: (x, y) and (x, y + 1), y even, 16 values. A shift in x or y moves to other
 //! rows; a shift in z would straddle rows, so the leaf is gathered once for each shift in z, every row 8 values long.
 
-use fearless_simd::{Simd, SimdBase};
+use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 use glam::IVec3;
 
 use super::simd::Lanes;
@@ -122,9 +122,13 @@ impl LeafHalo for Halo {
 pub struct StarHalo<const REACH: usize = 3> {
     /// By x; fourteen rows of 8 along y.
     slabs: [[f32; 112]; 14],
-    /// The leaf's own rows by shift in z (−1, 1, −2, 2, −3, 3), then x.
-    shifted: [[[f32; 64]; 8]; 6],
+    /// The leaves below and above in z, with room for loads that begin or end beyond them.
+    below: [f32; LEAF_VOXELS + ROW],
+    above: [f32; LEAF_VOXELS + 2 * ROW],
 }
+
+/// Voxels of a row.
+const ROW: usize = 8;
 
 /// For stencils over the six face neighbours.
 pub type FaceHalo = StarHalo<1>;
@@ -132,7 +136,7 @@ pub type FaceHalo = StarHalo<1>;
 impl<const REACH: usize> StarHalo<REACH> {
     /// A buffer to gather into.
     pub fn new() -> Self {
-        Self { slabs: [[0.0; 112]; 14], shifted: [[[0.0; 64]; 8]; 6] }
+        Self { slabs: [[0.0; 112]; 14], below: [0.0; LEAF_VOXELS + ROW], above: [0.0; LEAF_VOXELS + 2 * ROW] }
     }
 
     /// Copies the leaf in the middle of `around` and the voxels beyond each of its faces.
@@ -145,21 +149,13 @@ impl<const REACH: usize> StarHalo<REACH> {
         }
         let rim = 8 * REACH;
         for x in 0..8 {
-            let (own, below, above) = (slab(centre, x), slab(zm, x), slab(zp, x));
             let rows = &mut self.slabs[3 + x];
             rows[24 - rim..24].copy_from_slice(&slab(ym, x)[64 - rim..]);
-            rows[24..88].copy_from_slice(own);
+            rows[24..88].copy_from_slice(slab(centre, x));
             rows[88..88 + rim].copy_from_slice(&slab(yp, x)[..rim]);
-            let [m1, p1, m2, p2, m3, p3] = &mut self.shifted;
-            shift_up::<64, 1>(&mut m1[x], own, below);
-            shift_down::<64, 1>(&mut p1[x], own, above);
-            if REACH > 1 {
-                shift_up::<64, 2>(&mut m2[x], own, below);
-                shift_down::<64, 2>(&mut p2[x], own, above);
-                shift_up::<64, 3>(&mut m3[x], own, below);
-                shift_down::<64, 3>(&mut p3[x], own, above);
-            }
         }
+        self.below[..LEAF_VOXELS].copy_from_slice(zm);
+        self.above[ROW..ROW + LEAF_VOXELS].copy_from_slice(zp);
     }
 
     /// Rows (x, y) and (x, y + 1) of the leaf.
@@ -171,13 +167,24 @@ impl<const REACH: usize> StarHalo<REACH> {
     /// The rows `by` steps along `axis`.
     #[inline(always)]
     fn shifted_rows<S: Simd>(&self, simd: S, x: usize, y: usize, axis: usize, by: isize) -> Lanes<S> {
-        let steps = by.unsigned_abs();
         let rows = match axis {
-            0 => &self.slabs[(x + 3).wrapping_add_signed(by)][(y + 3) * 8..],
-            1 => &self.slabs[x + 3][(y + 3).wrapping_add_signed(by) * 8..],
-            _ => &self.shifted[2 * steps - usize::from(by < 0) - 1][x][y * 8..],
+            0 => &self.slabs[(x + 3).wrapping_add_signed(by)][(y + 3) * ROW..],
+            1 => &self.slabs[x + 3][(y + 3).wrapping_add_signed(by) * ROW..],
+            _ => &self.slabs[x + 3][((y + 3) * ROW).wrapping_add_signed(by)..],
         };
-        Lanes::from_slice(simd, &rows[..16])
+        let lanes = Lanes::from_slice(simd, &rows[..16]);
+        if axis < 2 {
+            return lanes;
+        }
+        // What straddles the rows' ends is of the leaf below or above: the same lanes of a load there.
+        let (steps, at) = (by.unsigned_abs(), x * 64 + y * ROW);
+        let (beyond, row) = if by < 0 {
+            (&self.below[at + ROW - steps..], (1 << steps) - 1)
+        } else {
+            (&self.above[at + steps..], 0xff & !(0xff >> steps))
+        };
+        let mask = mask32x16::from_bitmask(simd, row << 8 | row);
+        mask.select(Lanes::from_slice(simd, &beyond[..16]), lanes)
     }
 }
 
