@@ -4,14 +4,17 @@
 //! library's argument and the options of the command; its field documentation is the help. The command line finds operators
 //! in [`REGISTRY`] and knows nothing of any one of them.
 
+pub mod blend;
 pub mod compare;
 pub mod csg;
 mod curvature;
 pub mod distance;
+pub mod fillet;
 pub mod morphology;
 mod params;
 mod registry;
 pub mod shape;
+pub mod sharpen;
 pub mod smooth;
 mod solver;
 pub mod transform;
