@@ -2,6 +2,7 @@
 //!
 //! Grids of a `.vdb` are verified, meshes converted; outputs are settled before any work and written at its end.
 
+pub mod frames;
 pub mod input;
 pub mod mesh_output;
 pub mod output;
