@@ -6,6 +6,7 @@
 
 pub mod compare;
 pub mod csg;
+mod curvature;
 pub mod distance;
 pub mod morphology;
 mod params;
@@ -16,6 +17,7 @@ pub mod smooth;
 mod solver;
 pub mod transform;
 
+pub use curvature::{CurvatureOptions, Preset};
 pub(crate) use params::words;
 pub use params::{Vector, VoxelLength, WorldLength};
 pub(crate) use registry::parse;
