@@ -6,6 +6,7 @@
 
 pub mod compare;
 pub mod csg;
+mod curvature;
 pub mod distance;
 pub mod morphology;
 mod params;
@@ -15,6 +16,7 @@ pub mod smooth;
 mod solver;
 pub mod transform;
 
+pub use curvature::{CurvatureOptions, Preset};
 pub use params::{Vector, VoxelLength, WorldLength};
 pub use registry::{Arity, Entry, Operator, Outcome, Parameter, REGISTRY, Summary, find};
 pub use solver::{EvolutionOptions, Like, RegionSpecs, Scheme};
