@@ -191,7 +191,7 @@ impl Planner<'_, '_> {
             }
             Some(Meaning::Parameter(parameter)) => {
                 let value = match value {
-                    Value::String(path) if parameter.kind == "file" => self.file(&key.name, &path, &place)?.into(),
+                    Value::String(path) if parameter.kind == "FILE" => self.file(&key.name, &path, &place)?.into(),
                     Value::String(text) if parameter.name == "spec" => self.spec(&text, &place)?.into(),
                     // Between keyframes, whole numbers are rounded.
                     Value::Number(number) if parameter.kind == "integer" && !key.value.is_number() => whole(number),

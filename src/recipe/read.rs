@@ -362,3 +362,12 @@ impl Reader<'_> {
         Ok(steps)
     }
 }
+
+/// A whole text as JSON.
+#[cfg(test)]
+pub(super) fn json_of(text: &str) -> Value {
+    let reader = Reader { text, path: Path::new("test.toml") };
+    let table = DeTable::parse(text).unwrap();
+    let span = table.span();
+    reader.json(&Spanned::new(span, DeValue::Table(table.into_inner()))).unwrap()
+}

@@ -49,7 +49,7 @@ words! {
 #[serde(default)]
 pub(super) struct Picture {
     /// Where to: a .png. `####`, `%04d` and `$F4` become the frame.
-    #[schemars(extend("x-kind" = "file"))]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub path: String,
     /// What the colours say; `region` needs `region`, `difference` two inputs and draws the first.
     pub color_by: Color,

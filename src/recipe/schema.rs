@@ -125,3 +125,109 @@ fn dynamic(schema: Value, parameter: &Parameter) -> Value {
     }
     json!({ "description": parameter.help, "anyOf": alternatives })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::super::read::json_of;
+    use super::*;
+
+    /// Whether a value is valid by the keywords that the schema uses; any other keyword that restricts is a failure of the test.
+    fn valid(value: &Value, schema: &Value, root: &Value) -> bool {
+        let all = |list: &Value| list.as_array().unwrap().iter().filter(|s| valid(value, s, root)).count();
+        let count = value.as_array().map(Vec::len);
+        schema.as_object().unwrap().iter().all(|(keyword, rule)| match keyword.as_str() {
+            "$ref" => valid(value, root.pointer(rule.as_str().unwrap().trim_start_matches('#')).unwrap(), root),
+            "anyOf" => all(rule) > 0,
+            "oneOf" => all(rule) == 1,
+            "const" => value == rule,
+            "enum" => rule.as_array().unwrap().contains(value),
+            "type" => match rule {
+                Value::Array(kinds) => kinds.iter().any(|kind| is_a(value, kind.as_str().unwrap())),
+                kind => is_a(value, kind.as_str().unwrap()),
+            },
+            "properties" => {
+                let given = value.as_object().into_iter().flatten();
+                given.into_iter().all(|(name, value)| rule.get(name).is_none_or(|schema| valid(value, schema, root)))
+            }
+            "required" => {
+                let has = |name: &Value| value.get(name.as_str().unwrap()).is_some();
+                !value.is_object() || rule.as_array().unwrap().iter().all(has)
+            }
+            "additionalProperties" => {
+                assert_eq!(rule, false);
+                let known = schema["properties"].as_object().unwrap();
+                value.as_object().is_none_or(|given| given.keys().all(|name| known.contains_key(name)))
+            }
+            "items" => value.as_array().into_iter().flatten().all(|entry| valid(entry, rule, root)),
+            "minItems" => count.is_none_or(|n| n as u64 >= rule.as_u64().unwrap()),
+            "maxItems" => count.is_none_or(|n| n as u64 <= rule.as_u64().unwrap()),
+            "minimum" => value.as_f64().is_none_or(|v| v >= rule.as_f64().unwrap()),
+            "maximum" => value.as_f64().is_none_or(|v| v <= rule.as_f64().unwrap()),
+            "pattern" if rule == "\\$" => value.as_str().is_none_or(|text| text.contains('$')),
+            "pattern" | "propertyNames" | "format" | "default" | "description" | "title" | "$schema" | "$defs" => true,
+            "x-kind" | "x-list" => true,
+            other => panic!("the test does not know `{other}`"),
+        })
+    }
+
+    fn is_a(value: &Value, kind: &str) -> bool {
+        match kind {
+            "object" => value.is_object(),
+            "array" => value.is_array(),
+            "string" => value.is_string(),
+            "boolean" => value.is_boolean(),
+            "null" => value.is_null(),
+            "integer" => value.is_i64() || value.is_u64(),
+            "number" => value.is_number(),
+            other => panic!("the test does not know the type `{other}`"),
+        }
+    }
+
+    #[test]
+    fn the_examples_are_valid_and_slips_are_not() {
+        let schema = schema();
+        let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/recipes");
+        let mut count = 0;
+        for entry in std::fs::read_dir(examples).unwrap() {
+            let path = entry.unwrap().path();
+            let text = std::fs::read_to_string(&path).unwrap();
+            let recipe = json_of(&text);
+            assert!(valid(&recipe, &schema, &schema), "{}", path.display());
+            for (right, wrong) in [
+                ("voxel_size =", "voxl_size ="),
+                ("name = \"", "name = 3 #"),
+                ("op = \"shape\"", "op = \"shap\""),
+                ("version = 1", "version = 2"),
+                ("input = \"", "inputt = \""),
+            ] {
+                // Variables of [set] have any name.
+                let steps = text.find("[[step]]").unwrap();
+                let slip = format!("{}{}", &text[..steps], text[steps..].replacen(right, wrong, 1));
+                let slip = if right.starts_with("version") { text.replacen(right, wrong, 1) } else { slip };
+                assert!(slip == text || !valid(&json_of(&slip), &schema, &schema), "{}: {wrong}", path.display());
+            }
+            count += 1;
+        }
+        assert!(count > 0);
+    }
+
+    #[test]
+    fn what_differs_by_frame_is_valid_too() {
+        let schema = schema();
+        let recipe = |step: &str| json_of(&format!("version = 1\n[[step]]\nname = \"a\"\n{step}"));
+        for (step, fits) in [
+            ("op = \"smooth\"\ninput = \"b\"\niterations = { frames = [1, 2], values = [3, 4] }", true),
+            ("op = \"smooth\"\ninput = \"b\"\niterations = \"$n\"\nregion_not = [\"sphere radius=1\"]", true),
+            ("op = \"smooth\"\ninput = \"b\"\niterations = \"many\"", false),
+            ("op = \"transform\"\ninput = \"b\"\nmirror = \"x\"\ntranslate = [1, 2, 3]", true),
+            ("op = \"csg\"\ninput = \"b\"", false),
+            ("op = \"csg\"\ninputs = [\"b\", \"c.obj\"]\noperation = \"union\"", true),
+            ("op = \"assert\"\ninput = \"b\"\nvolume = [1, 2]\ngenus = [0, 1]\nlargest_curvature = 0.5", true),
+            ("op = \"assert\"\ninput = \"b\"\nvolume = 1", false),
+        ] {
+            assert_eq!(valid(&recipe(step), &schema, &schema), fits, "{step}");
+        }
+    }
+}

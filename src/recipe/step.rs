@@ -221,7 +221,7 @@ words! {
 #[serde(default)]
 pub(super) struct Target {
     /// Where to: .vdb, .obj, .ply, .stl, .glb, .gltf or .off. `####`, `%04d` and `$F4` become the frame.
-    #[schemars(extend("x-kind" = "file"))]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub path: String,
     /// How a .vdb stores values; as the input if not given, else float.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -241,7 +241,7 @@ pub(super) struct Target {
     pub quads: bool,
     /// Give a mesh the colours and texture coordinates of this mesh, by closest point.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schemars(extend("x-kind" = "file"))]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub attributes_from: Option<String>,
 }
 
