@@ -5,6 +5,7 @@
 //! in [`REGISTRY`] and knows nothing of any one of them.
 
 pub mod compare;
+mod confine;
 pub mod csg;
 pub mod distance;
 pub mod morphology;

@@ -11,6 +11,7 @@ mod morph;
 mod renormalize;
 mod speed;
 mod step;
+mod threshold;
 mod track;
 mod tracker;
 
@@ -19,6 +20,7 @@ pub use filter::{Filter, FilterKind, filter, offset};
 pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
 pub use speed::SpeedFunction;
+pub use threshold::grow_by_threshold;
 pub use track::track;
 pub use tracker::Tracker;
 
