@@ -17,6 +17,7 @@ pub(crate) mod marching;
 mod measure;
 pub(crate) mod sample;
 pub mod shapes;
+pub mod smooth_csg;
 mod sweep;
 #[cfg(test)]
 pub(crate) mod testing;

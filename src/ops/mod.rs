@@ -7,6 +7,7 @@
 pub mod compare;
 mod confine;
 pub mod csg;
+mod curvature;
 pub mod distance;
 pub mod morphology;
 mod params;
@@ -16,6 +17,7 @@ pub mod smooth;
 mod solver;
 pub mod transform;
 
+pub use curvature::{CurvatureOptions, Preset};
 pub use params::{Vector, VoxelLength, WorldLength};
 pub use registry::{Arity, Entry, Operator, Outcome, Parameter, REGISTRY, Summary, find};
 pub use solver::{EvolutionOptions, Like, RegionSpecs, Scheme};

@@ -4,9 +4,11 @@
 //! |∇φ| = 1; [`track`] lets the band follow
 //! the surface: dilate, renormalise, trim. A [`Tracker`] does these steps one by one.
 
+mod curvature_flow;
 mod domain;
 mod evolve;
 mod filter;
+mod gate;
 mod morph;
 mod renormalize;
 mod speed;
@@ -15,8 +17,10 @@ mod threshold;
 mod track;
 mod tracker;
 
+pub use curvature_flow::FlowCurvature;
 pub use evolve::{Report, StopReason, Until, evolve};
 pub use filter::{Filter, FilterKind, filter, offset};
+pub use gate::{CutOff, Direction};
 pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
 pub use speed::SpeedFunction;
