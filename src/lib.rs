@@ -73,6 +73,7 @@ pub mod cli;
 #[cfg(feature = "openvdb")]
 pub mod crosscheck;
 pub mod error;
+pub(crate) mod files;
 pub mod grid;
 pub mod levelset;
 pub mod mesh;

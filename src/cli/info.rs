@@ -7,10 +7,11 @@ use glam::DVec3;
 use serde_json::{Map, Value, json};
 
 use super::context::Context;
-use super::input::{self, InputOptions};
-use super::volume::{self, BandState, Description, GridDescription, VolumeGrid};
-use super::{Verb, args, output, size, table};
+use super::{Verb, args, files, size, table};
 use crate::error::{EditError, Result};
+use crate::files::input::{self, InputOptions};
+use crate::files::output;
+use crate::files::volume::{self, BandState, Description, GridDescription, VolumeGrid};
 use crate::levelset::{CurvatureKind, LevelSet, Measures, Violation, curvature};
 use crate::{mesh, spec};
 
@@ -34,7 +35,7 @@ fn build(command: Command) -> Command {
 
 fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let paths: Vec<PathBuf> = args::paths(matches, "input");
-    let options = InputOptions::new(matches)?;
+    let options = files::input_options(matches)?;
     let curvature = CurvatureFile::plan(matches, &paths)?;
     let mut found = Vec::new();
     for path in &paths {
@@ -96,7 +97,7 @@ impl CurvatureFile {
     /// Computes and writes it, and adds it to what is said of the file.
     fn write(self, inputs: &[PathBuf], options: &InputOptions, found: &mut Found, context: &Context) -> Result<()> {
         // The grid that the level set was read from is written as well.
-        let loaded = input::load_whole(inputs, options, &mut found.warnings, context)?;
+        let loaded = input::load_whole(inputs, options, &mut found.warnings, &context.run)?;
         let Some(input) = loaded.first() else { return Ok(()) };
         let field = curvature(&input.level_set, self.kind, &context.run)?;
         let name = format!("{}_curvature", self.word);

@@ -13,11 +13,9 @@ mod convert;
 #[cfg(feature = "openvdb")]
 mod crosscheck;
 mod edit;
+mod files;
 mod info;
-mod input;
-mod mesh_output;
 mod options;
-mod output;
 mod preview;
 mod progress;
 mod render;
@@ -25,11 +23,6 @@ mod report;
 mod signal;
 mod size;
 mod table;
-#[cfg(feature = "openvdb")]
-mod volume;
-#[cfg(not(feature = "openvdb"))]
-#[path = "volume_absent.rs"]
-mod volume;
 
 use std::ffi::OsString;
 use std::process::ExitCode;

@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use clap::ArgMatches;
 
 use super::context::Context;
-use super::{output, render};
+use super::render;
 use crate::error::Result;
+use crate::files::output;
 use crate::levelset::LevelSet;
 use crate::render::{ColorBy, Frame, Image, RenderOptions, render as draw};
 

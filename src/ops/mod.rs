@@ -12,6 +12,7 @@ pub mod distance;
 pub mod morphology;
 mod params;
 mod registry;
+mod sequence;
 pub mod shape;
 pub mod smooth;
 mod solver;
@@ -19,5 +20,7 @@ pub mod transform;
 
 pub use curvature::{CurvatureOptions, Preset};
 pub use params::{Vector, VoxelLength, WorldLength};
-pub use registry::{Arity, Entry, Operator, Outcome, Parameter, REGISTRY, Summary, find};
+pub use registry::{Arity, Entry, Operator, Outcome, Parameter, ParameterSet, REGISTRY, Summary, find};
+pub(crate) use registry::parse;
+pub use sequence::{Sequence, SequenceOption};
 pub use solver::{EvolutionOptions, Like, RegionSpecs, Scheme};

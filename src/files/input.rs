@@ -2,17 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::ArgMatches;
 use glam::DVec3;
-use serde_json::Value;
 
-use super::context::Context;
+use super::mesh_output;
 use super::volume::{self, BandState, Choice, Volume, VolumeGrid};
-use super::{args, mesh_output, table};
 use crate::error::{EditError, Result};
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, Violation, ViolationKind};
 use crate::mesh::{self, MeshFormat, MeshToLevelSet, Rebuild, TriangleMesh, mesh_to_level_set, rebuild};
 use crate::ops::{VoxelLength, WorldLength};
+use crate::run::RunOptions;
 
 /// What can be read and written.
 pub const EXTENSIONS: &str = ".vdb, .obj, .ply, .stl, .glb, .gltf or .off";
@@ -39,14 +37,22 @@ pub fn is_volume(path: &Path) -> bool {
 }
 
 /// How inputs are read.
+#[derive(Clone, Debug, Default)]
 pub struct InputOptions {
-    grids: Vec<String>,
-    assume_level_set: bool,
-    repair: bool,
-    strict: bool,
-    voxel_size: Option<f64>,
-    resolution: Option<f64>,
-    half_width: Option<VoxelLength>,
+    /// Which level set of each `.vdb`; the last name goes for all that follow.
+    pub grids: Vec<String>,
+    /// Whether float grids without a class are taken for level sets.
+    pub assume_level_set: bool,
+    /// Whether invalid level sets are rebuilt from their surface.
+    pub repair: bool,
+    /// Whether meshes that would have to be repaired are refused.
+    pub strict: bool,
+    /// Edge of a voxel, for meshes.
+    pub voxel_size: Option<WorldLength>,
+    /// Voxels along the longest axis of all meshes together.
+    pub resolution: Option<f64>,
+    /// Half width of the band, for meshes.
+    pub half_width: Option<VoxelLength>,
 }
 
 /// A level set from a file.
@@ -69,43 +75,24 @@ impl Input {
 }
 
 impl InputOptions {
-    /// From the options of a command, whether they are its own or its operator's.
-    pub fn new(matches: &ArgMatches) -> Result<Self> {
-        let value = |id: &str| matches.try_get_one::<Value>(id).ok().flatten().cloned();
-        let refuse = |field: &str, value: &Value, accepted: &str| {
-            Err(EditError::parameter("convert", field, value.to_string().trim_matches('"'), accepted))
-        };
-        let voxel_size = match value("voxel_size") {
-            None => None,
-            Some(given) => match length_in_world(&given) {
-                Some(size) if size > 0.0 => Some(size),
-                _ => return refuse("voxel_size", &given, "a positive length in world units, such as 0.01"),
-            },
-        };
-        let resolution = match value("resolution") {
-            None => None,
-            Some(given) => match given.as_f64() {
-                Some(n) if n >= 1.0 => Some(n),
-                _ => return refuse("resolution", &given, "a number of voxels, 1 or more, such as 256"),
-            },
-        };
-        let half_width = match value("half_width") {
-            None => None,
-            Some(given) => match serde_json::from_value(given.clone()) {
-                Ok(width) => Some(width),
-                Err(_) => return refuse("half_width", &given, "a number of voxels, such as 3"),
-            },
-        };
-        let grids = matches.try_get_many::<String>("grid").ok().flatten();
-        Ok(Self {
-            grids: grids.map(|names| names.cloned().collect()).unwrap_or_default(),
-            assume_level_set: args::flag(matches, "assume-level-set"),
-            repair: args::flag(matches, "repair"),
-            strict: args::flag(matches, "strict"),
-            voxel_size,
-            resolution,
-            half_width,
-        })
+    /// Refuses what cannot work.
+    pub fn validate(&self) -> Result<()> {
+        let refuse =
+            |field: &str, value: String, accepted: &str| Err(EditError::parameter("convert", field, value, accepted));
+        if let Some(size) = self.voxel_size {
+            // Asked in a world whose voxels have no size, a length in voxels is no number.
+            let world = size.world(f64::NAN);
+            if !(world > 0.0 && world.is_finite()) {
+                return refuse("voxel_size", size.to_string(), "a positive length in world units, such as 0.01");
+            }
+        }
+        match (self.resolution, self.voxel_size) {
+            (Some(n), _) if !(n >= 1.0 && n.is_finite()) => {
+                refuse("resolution", n.to_string(), "a number of voxels, 1 or more, such as 256")
+            }
+            (Some(n), Some(_)) => refuse("resolution", n.to_string(), "either `voxel_size` or `resolution`, not both"),
+            _ => Ok(()),
+        }
     }
 
     /// Whether a size for meshes was given.
@@ -118,14 +105,6 @@ impl InputOptions {
         let grid = self.grids.get(n).or(self.grids.last());
         Choice { grid: grid.map(String::as_str), assume_level_set: self.assume_level_set }
     }
-}
-
-/// World units of a length that cannot be in voxels, because it says how large a voxel is.
-fn length_in_world(value: &Value) -> Option<f64> {
-    if value.as_str().is_some_and(|text| text.ends_with("vx")) {
-        return None;
-    }
-    serde_json::from_value::<WorldLength>(value.clone()).ok().map(|length| length.world(1.0))
 }
 
 /// Finds out without reading whole files whether all inputs are there; returns one line each on what they are.
@@ -172,9 +151,9 @@ pub fn load(
     paths: &[PathBuf],
     options: &InputOptions,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<Vec<Input>> {
-    load_with(paths, options, Volume::take, warnings, context)
+    load_with(paths, options, Volume::take, warnings, run)
 }
 
 /// As [`load`], for results that go beside the grids that the level sets are read from: files stay whole.
@@ -182,9 +161,9 @@ pub fn load_whole(
     paths: &[PathBuf],
     options: &InputOptions,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<Vec<Input>> {
-    load_with(paths, options, |volume, choice| volume.read(choice), warnings, context)
+    load_with(paths, options, |volume, choice| volume.read(choice), warnings, run)
 }
 
 fn load_with(
@@ -192,7 +171,7 @@ fn load_with(
     options: &InputOptions,
     read: impl Fn(&mut Volume, Choice) -> Result<VolumeGrid>,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<Vec<Input>> {
     if paths.iter().filter(|path| is_pipe(path)).count() > 1 {
         let accepted = "standard input can be read once: give `-` once";
@@ -205,9 +184,9 @@ fn load_with(
     let mut raw = Vec::new();
     let mut volumes = 0;
     for path in paths {
-        context.run.check("reading")?;
+        run.check("reading")?;
         if is_volume(path) {
-            let mut volume = volume::open(path, &context.run)?;
+            let mut volume = volume::open(path, run)?;
             warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
             let grid = read(&mut volume, options.choice(volumes))?;
             volumes += 1;
@@ -223,10 +202,10 @@ fn load_with(
             Raw::Volume(read) => {
                 let (volume, grid) = *read;
                 let index = grid.index;
-                (valid(path, grid, options, warnings, context)?, Some((volume, Some(index))), None)
+                (valid(path, grid, options, warnings, run)?, Some((volume, Some(index))), None)
             }
             Raw::Mesh(mesh) => {
-                (convert(path, &mesh, &conversion, warnings, context)?, None, mesh_output::attributes_of(&mesh))
+                (convert(path, &mesh, &conversion, warnings, run)?, None, mesh_output::attributes_of(&mesh))
             }
         };
         if level_set.is_empty() {
@@ -243,20 +222,20 @@ pub fn load_iso(
     options: &InputOptions,
     iso: f32,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<Option<Input>> {
     if !is_volume(path) || is_pipe(path) {
         return Ok(None);
     }
     let choice = options.choice(0);
-    let volume = volume::open(path, &context.run)?;
+    let volume = volume::open(path, run)?;
     if volume.has_level_set(choice) {
         return Ok(None);
     }
     warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
-    let field = volume.read_iso_field(choice.grid, iso, &context.run)?;
+    let field = volume.read_iso_field(choice.grid, iso, run)?;
     let half_width = options.half_width.map_or(DEFAULT_HALF_WIDTH, |w| w.voxels(field.voxel_size()) as f32);
-    let level_set = rebuild(&field, &Rebuild::band(half_width), &context.run)?;
+    let level_set = rebuild(&field, &Rebuild::band(half_width), run)?;
     if level_set.is_empty() {
         return Err(EditError::input(path, format!("no voxel holds more than {iso}: there is no surface")));
     }
@@ -292,7 +271,7 @@ fn conversion_of(raw: &[Raw], options: &InputOptions) -> Result<MeshToLevelSet> 
     let longest = together.map_or(0.0, |(lo, hi)| (hi - lo).max_element());
     let by_resolution = |n: f64| longest / n;
     let voxel_size = match (options.voxel_size, options.resolution, volume) {
-        (Some(size), ..) => size,
+        (Some(size), ..) => size.world(1.0),
         (None, Some(n), _) => by_resolution(n),
         (None, None, Some(level_set)) => level_set.voxel_size(),
         (None, None, None) => by_resolution(DEFAULT_RESOLUTION),
@@ -312,19 +291,18 @@ fn convert(
     mesh: &TriangleMesh,
     conversion: &MeshToLevelSet,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<LevelSet> {
-    let (level_set, findings) =
-        mesh_to_level_set(mesh, conversion, &context.run).map_err(|error| naming(path, error))?;
+    let (level_set, findings) = mesh_to_level_set(mesh, conversion, run).map_err(|error| naming(path, error))?;
     warnings.extend(findings.warnings().into_iter().map(|w| format!("{}: {w}", path.display())));
     // Where the mesh was repaired, its own volume says nothing.
     if findings.is_sound() && findings.duplicates_dropped == 0 {
-        let (wanted, has) = (enclosed_volume(mesh), level_set.measure(&context.run)?.volume);
+        let (wanted, has) = (enclosed_volume(mesh), level_set.measure(run)?.volume);
         if (has - wanted).abs() > LOST * wanted.abs() {
             warnings.push(format!(
-                "{}: the level set has {} % of the mesh's volume: parts or walls thinner than a voxel are lost; take a voxel size smaller than {:e}",
+                "{}: the level set has {:.1} % of the mesh's volume: parts or walls thinner than a voxel are lost; take a voxel size smaller than {:e}",
                 path.display(),
-                table::number(100.0 * has / wanted.abs()),
+                100.0 * has / wanted.abs(),
                 conversion.voxel_size
             ));
         }
@@ -352,7 +330,7 @@ fn valid(
     grid: VolumeGrid,
     options: &InputOptions,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<LevelSet> {
     let name = format!("{} [{}]", path.display(), grid.selector);
     let refuse = |problem: String| EditError::NotALevelSet {
@@ -369,7 +347,7 @@ fn valid(
         BandState::Rebuild { what, gross } if gross && !options.repair => return Err(refuse(what)),
         BandState::Rebuild { what, .. } => {
             warnings.push(format!("{name}: {what}: rebuilt from its surface"));
-            (rebuilt(&grid.level_set, context)?, true)
+            (rebuilt(&grid.level_set, run)?, true)
         }
     };
     let violations = level_set.check();
@@ -377,7 +355,7 @@ fn valid(
     if !violations.is_empty() {
         if options.repair && !is_rebuilt {
             warnings.push(format!("{name}: {said}: rebuilt from its surface"));
-            return rebuilt(&level_set, context);
+            return rebuilt(&level_set, run);
         }
         if is_gross(&violations, level_set.grid().active_voxels()) {
             return Err(refuse(said));
@@ -386,10 +364,10 @@ fn valid(
     }
     if level_set.half_width() < NARROWEST && !level_set.is_empty() {
         warnings.push(format!(
-            "{name}: its band of {} voxels is too narrow to be edited: rebuilt from its surface with {DEFAULT_HALF_WIDTH}",
-            table::number(f64::from(level_set.half_width()))
+            "{name}: its band of {:.2} voxels is too narrow to be edited: rebuilt from its surface with {DEFAULT_HALF_WIDTH}",
+            level_set.half_width()
         ));
-        return rebuilt(&level_set, context);
+        return rebuilt(&level_set, run);
     }
     Ok(level_set)
 }
@@ -406,9 +384,9 @@ fn is_gross(violations: &[Violation], active_voxels: u64) -> bool {
 }
 
 /// Distances anew from the surface, in a band that is wide enough for every operator.
-fn rebuilt(level_set: &LevelSet, context: &Context) -> Result<LevelSet> {
+fn rebuilt(level_set: &LevelSet, run: &RunOptions) -> Result<LevelSet> {
     let half_width = level_set.half_width().max(DEFAULT_HALF_WIDTH);
-    rebuild(level_set, &Rebuild::band(half_width), &context.run)
+    rebuild(level_set, &Rebuild::band(half_width), run)
 }
 
 #[cfg(test)]
@@ -428,8 +406,10 @@ mod tests {
 
     #[test]
     fn voxel_sizes_are_not_in_voxels() {
-        assert_eq!(length_in_world(&"0.5wu".into()), Some(0.5));
-        assert_eq!(length_in_world(&0.25.into()), Some(0.25));
-        assert_eq!(length_in_world(&"3vx".into()), None);
+        let of = |size: &str| InputOptions { voxel_size: size.parse().ok(), ..InputOptions::default() }.validate();
+        assert!(of("0.5wu").is_ok() && of("0.25").is_ok());
+        for size in ["3vx", "0", "-1"] {
+            assert!(of(size).is_err(), "{size}");
+        }
     }
 }

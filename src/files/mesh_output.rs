@@ -2,18 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::ArgMatches;
 use serde_json::{Map, Value};
 
-use super::context::Context;
+use super::input;
 use super::output::Written;
-use super::{args, input};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{
     self, Attributes, Bound, MeshFormat, TriangleMesh, level_set_to_mesh, level_set_to_quads, simplify,
     transfer_attributes,
 };
+use crate::run::RunOptions;
 
 /// The options of a mesh.
 #[derive(Default)]
@@ -37,17 +36,29 @@ enum Faces {
     Quads,
 }
 
+/// What is asked of a mesh; at most one of the first three.
+#[derive(Clone, Debug, Default)]
+pub struct MeshParams {
+    /// Part of the triangles to keep.
+    pub simplify: Option<f64>,
+    /// Voxels that vertices left out may be away from the result.
+    pub adaptivity: Option<f64>,
+    /// Quads instead of triangles.
+    pub quads: bool,
+    /// The mesh whose colours and texture coordinates are taken over.
+    pub attributes_from: Option<PathBuf>,
+}
+
 impl MeshOptions {
-    /// From the options of a command that writes to `path`: refused if that is no mesh, or cannot hold what is asked.
-    pub fn new(matches: &ArgMatches, path: &Path) -> Result<Self> {
-        let number = |id: &str| matches.try_get_one::<f64>(id).ok().flatten().copied();
-        let faces = match (number("simplify"), number("adaptivity")) {
+    /// For a mesh at `path`: refused if that is no mesh, or cannot hold what is asked.
+    pub fn new(params: &MeshParams, path: &Path) -> Result<Self> {
+        let faces = match (params.simplify, params.adaptivity) {
             (Some(ratio), _) => Faces::Part(ratio),
             (None, Some(voxels)) => Faces::Within(voxels),
-            (None, None) if args::flag(matches, "quads") => Faces::Quads,
+            (None, None) if params.quads => Faces::Quads,
             (None, None) => Faces::All,
         };
-        let source = args::paths(matches, "attributes-from").pop();
+        let source = params.attributes_from.clone();
         let format = MeshFormat::of(path);
         let refuse = |field: &str, value: String, accepted: &str| {
             Err(EditError::parameter("vdb-edit", field, value, accepted.to_owned()))
@@ -102,17 +113,12 @@ impl MeshOptions {
     }
 
     /// Writes the surface φ = `iso`.
-    pub fn write_level_set(&self, path: &Path, level_set: &LevelSet, iso: f32, context: &Context) -> Result<Written> {
+    pub fn write_level_set(&self, path: &Path, level_set: &LevelSet, iso: f32, run: &RunOptions) -> Result<Written> {
         if self.faces != Faces::Quads {
-            return self.write_triangles(
-                path,
-                level_set_to_mesh(level_set, iso, &context.run)?,
-                level_set.voxel_size(),
-                context,
-            );
+            return self.write_triangles(path, level_set_to_mesh(level_set, iso, run)?, level_set.voxel_size(), run);
         }
-        let mut mesh = level_set_to_quads(level_set, iso, &context.run)?;
-        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, context)? {
+        let mut mesh = level_set_to_quads(level_set, iso, run)?;
+        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, run)? {
             (mesh.colors, mesh.uvs) = (colors, uvs);
         }
         mesh::write_quads(path, &mesh)?;
@@ -126,8 +132,8 @@ impl MeshOptions {
     }
 
     /// Writes a mesh that came from a file.
-    pub fn write_mesh(&self, path: &Path, mesh: TriangleMesh, context: &Context) -> Result<Written> {
-        self.write_triangles(path, mesh, 1.0, context)
+    pub fn write_mesh(&self, path: &Path, mesh: TriangleMesh, run: &RunOptions) -> Result<Written> {
+        self.write_triangles(path, mesh, 1.0, run)
     }
 
     fn write_triangles(
@@ -135,7 +141,7 @@ impl MeshOptions {
         path: &Path,
         mut mesh: TriangleMesh,
         voxel_size: f64,
-        context: &Context,
+        run: &RunOptions,
     ) -> Result<Written> {
         let mut warnings = self.warnings.clone();
         let mut details = Map::new();
@@ -145,13 +151,13 @@ impl MeshOptions {
             _ => None,
         };
         if let Some(bound) = bound {
-            let simplified = simplify(&mesh, bound, &context.run)?;
+            let simplified = simplify(&mesh, bound, run)?;
             details.insert("triangles_before".into(), mesh.triangles.len().into());
             details.insert("deviation".into(), simplified.deviation.into());
             warnings.extend(simplified.warnings);
             mesh = simplified.mesh;
         }
-        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, context)? {
+        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, run)? {
             (mesh.colors, mesh.uvs) = (colors, uvs);
         }
         mesh::write(path, &mesh)?;
@@ -159,9 +165,9 @@ impl MeshOptions {
         Ok(Written { bytes: size(path), warnings, details })
     }
 
-    fn attributes(&self, positions: &[glam::DVec3], context: &Context) -> Result<Option<Attributes>> {
+    fn attributes(&self, positions: &[glam::DVec3], run: &RunOptions) -> Result<Option<Attributes>> {
         let Some((path, source)) = &self.attributes else { return Ok(None) };
-        let found = transfer_attributes(source, positions, &context.run);
+        let found = transfer_attributes(source, positions, run);
         found.map(Some).map_err(|error| input::naming(path, error))
     }
 }
