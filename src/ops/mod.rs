@@ -12,6 +12,7 @@ pub mod distance;
 pub mod morphology;
 mod params;
 mod registry;
+pub mod segment;
 mod sequence;
 pub mod shape;
 pub mod smooth;

@@ -246,7 +246,7 @@ mod tests {
             ("superellipsoid radii=0.5,0.5,0.5", "sphere radius=0.5"),
             ("supertoroid radii=0.25,0.25,0.25 alpha=2", "torus major=0.5 minor=0.25"),
         ] {
-            let (ours, truth) = (make(spec, 0.02), Solid::parse(exact).unwrap());
+            let (ours, truth) = (make(spec, 0.02), Expression::parse(exact).unwrap());
             for &id in ours.grid().leaves() {
                 for at in ours.grid().mask(id).iter() {
                     let p = ours.transform().voxel_to_world(ours.grid().origin(id) + crate::grid::offset_to_local(at));

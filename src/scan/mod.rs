@@ -14,7 +14,7 @@ use glam::{DAffine3, DMat3, DVec3, IVec3};
 use rayon::prelude::*;
 
 use crate::error::{EditError, Result};
-use crate::grid::{LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, Transform, offset_to_local};
+use crate::grid::{LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, Transform, Volume, offset_to_local};
 use crate::levelset::{BYTES_A_LEAF, LevelSet, grid_of_leaves};
 use crate::run::RunOptions;
 
@@ -76,6 +76,27 @@ impl Scan {
             return Err("its axes do not span space".into());
         }
         Ok(Self { size, values, to_world })
+    }
+
+    /// The box around all that a sparse volume stores; `None` if that is nothing.
+    pub fn of_volume(volume: &Volume, run: &RunOptions) -> Result<Option<Self>, EditError> {
+        let Some((lo, hi)) = volume.index_bounds() else { return Ok(None) };
+        let size = (hi.as_i64vec3() - lo.as_i64vec3() + 1).to_array().map(|n| n as usize);
+        run.reserve("reading a volume", samples_bytes(size), "take a smaller volume")?;
+        let refuse = |problem: String| EditError::parameter("reading a volume", "size", format!("{size:?}"), problem);
+        if size.iter().any(|n| *n > MOST_ALONG) || samples_bytes(size) / 4 > MOST_SAMPLES as u64 {
+            return Err(refuse(format!("up to {MOST_ALONG} voxels along an axis, {MOST_SAMPLES} in all")));
+        }
+        let [nx, ny, _] = size;
+        let mut values = vec![0.0; size.iter().product()];
+        values.par_chunks_mut(nx * ny).enumerate().for_each(|(z, slice)| {
+            for (at, value) in slice.iter_mut().enumerate() {
+                *value = volume.value(lo + IVec3::new((at % nx) as i32, (at / nx) as i32, z as i32));
+            }
+        });
+        let to_world = volume.transform().to_world();
+        let place = to_world.transform_point3(lo.as_dvec3());
+        Self::new(size, values, DAffine3::from_mat3_translation(to_world.matrix3, place)).map(Some).map_err(refuse)
     }
 
     /// Reads a file. Memory is bounded by what the file can hold before any is taken.
