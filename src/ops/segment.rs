@@ -33,6 +33,7 @@ pub struct Segment {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub volume_grid: Option<String>,
     /// The value at the part's surface: inside is above it.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub iso: Option<f64>,
     /// The part ends at this value as well: inside is from `iso` to here.
     #[serde(skip_serializing_if = "Option::is_none")]

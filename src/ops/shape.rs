@@ -26,7 +26,7 @@ use crate::spec::Spec;
 #[serde(default)]
 pub struct Shape {
     /// The solid, such as `torus major=1 minor=0.3 axis=z` (world units). Kinds: `sphere`, `box`, `torus`, `cylinder`, `capsule`,
-    /// `superellipsoid`, `supertoroid`, and `bezier file=F [thickness=t]` for the patches of a BPT file. Solids combine:
+    /// `superellipsoid`, `supertoroid`, and `bezier file=F [thickness=t]` for the patches of a BPT file, or the Bézier and NURBS surfaces of an OBJ file. Solids combine:
     /// `union(A, B, …)`, `intersection(A, B, …)`, `difference(A, B, …)`, and `smooth-union(radius=r, A, B, …)` and its like with rounded edges.
     pub spec: String,
     /// Edge of a voxel in world units.
@@ -60,13 +60,16 @@ impl Source {
             return Expression::parse(text).map(Self::Solid);
         }
         let spec = Spec::parse("shape", text)?;
-        let file = spec.text("file").ok_or_else(|| spec.refuse("`bezier` needs `file=` (a BPT file of patches)"))?;
+        let file = spec.text("file").ok_or_else(|| spec.refuse("`bezier` needs `file=` (a BPT file of patches, or an OBJ file of free-form surfaces)"))?;
         let thickness = spec.number("thickness")?;
         spec.finish()?;
         if thickness.is_some_and(|t| t <= 0.0) {
             return Err(spec.refuse("`thickness` positive, or none for the inside of a closed surface"));
         }
-        Ok(Self::Patches { patches: BezierPatches::read(Path::new(file))?, thickness })
+        let file = Path::new(file);
+        let is_obj = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("obj"));
+        let patches = if is_obj { BezierPatches::read_obj(file)? } else { BezierPatches::read(file)? };
+        Ok(Self::Patches { patches, thickness })
     }
 
     fn bounds(&self) -> Result<(DVec3, DVec3)> {
