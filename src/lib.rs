@@ -50,6 +50,7 @@
 //! | [`region`] | where an operator acts, and how strongly |
 //! | [`pde`] | time stepping: flows, renormalisation, tracking of the band |
 //! | [`mesh`] | triangle meshes: files, to a level set and back, exact rebuilding |
+//! | [`scan`] | scans (NRRD, NIfTI), the surfaces in them, segmentation |
 //! | `vdb` | OpenVDB files and OpenVDB's own tools as a reference (feature `openvdb`) |
 //! | [`render`] | pictures |
 //! | [`ops`] | the operators and their registry |
@@ -83,6 +84,7 @@ pub mod recipe;
 pub mod region;
 pub mod render;
 pub mod run;
+pub mod scan;
 pub mod spec;
 pub mod stencil;
 #[cfg(feature = "openvdb")]

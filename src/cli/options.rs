@@ -21,6 +21,7 @@ struct Positional {
 const POSITIONALS: &[Positional] = &[
     Positional { operator: "csg", parameter: "operation", value_name: "OP" },
     Positional { operator: "shape", parameter: "spec", value_name: "SPEC" },
+    Positional { operator: "segment", parameter: "volume", value_name: "IN" },
 ];
 
 /// `d_min` as `d-min`.

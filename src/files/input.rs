@@ -11,9 +11,13 @@ use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, Violation, ViolationKind};
 use crate::mesh::{self, MeshFormat, MeshToLevelSet, Rebuild, TriangleMesh, mesh_to_level_set, rebuild};
 use crate::ops::{VoxelLength, WorldLength};
 use crate::run::RunOptions;
+use crate::scan::{Inside, Scan, is_scan};
 
 /// What can be read and written.
 pub const EXTENSIONS: &str = ".vdb, .obj, .ply, .stl, .glb, .gltf or .off";
+
+/// What to do with a scan where a level set is expected.
+const SCAN: &str = "is a scan: `vdb-edit convert --iso VALUE` makes a level set of it, `vdb-edit segment` a smooth one";
 
 /// Voxels along the longest axis where no size is given.
 const DEFAULT_RESOLUTION: f64 = 256.0;
@@ -129,6 +133,7 @@ pub fn probe(paths: &[PathBuf], options: &InputOptions) -> Result<Vec<String>> {
 
 fn mesh_format(path: &Path) -> Result<MeshFormat> {
     MeshFormat::of(path).ok_or_else(|| match std::fs::metadata(path) {
+        Ok(_) if is_scan(path) => EditError::input(path, SCAN),
         Err(e) => EditError::input(path, format!("cannot be opened: {e}")),
         Ok(facts) if facts.is_dir() => EditError::input(path, "is a folder; a file is wanted"),
         Ok(_) => {
@@ -221,9 +226,23 @@ pub fn load_iso(
     path: &Path,
     options: &InputOptions,
     iso: f32,
+    inside: Inside,
     warnings: &mut Vec<String>,
     run: &RunOptions,
 ) -> Result<Option<Input>> {
+    let half_width = |voxel_size| options.half_width.map_or(DEFAULT_HALF_WIDTH, |w| w.voxels(voxel_size) as f32);
+    let no_surface = || {
+        let side = if inside == Inside::Above { "more" } else { "less" };
+        EditError::input(path, format!("no voxel holds {side} than {iso}: there is no surface"))
+    };
+    if is_scan(path) {
+        let scan = Scan::read(path, run)?;
+        let (scan, resampled) = scan.on_cubes(run).map_err(|problem| EditError::input(path, problem))?;
+        warnings.extend(resampled.map(|said| format!("{}: {said}", path.display())));
+        let field = scan.iso_field(iso, inside, run).map_err(|error| naming(path, error))?.ok_or_else(no_surface)?;
+        let level_set = rebuild(&field, &Rebuild::band(half_width(field.voxel_size())), run)?;
+        return Ok(Some(Input { path: path.to_path_buf(), level_set, source: None, attributes: None }));
+    }
     if !is_volume(path) || is_pipe(path) {
         return Ok(None);
     }
@@ -233,11 +252,10 @@ pub fn load_iso(
         return Ok(None);
     }
     warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
-    let field = volume.read_iso_field(choice.grid, iso, run)?;
-    let half_width = options.half_width.map_or(DEFAULT_HALF_WIDTH, |w| w.voxels(field.voxel_size()) as f32);
-    let level_set = rebuild(&field, &Rebuild::band(half_width), run)?;
+    let field = volume.read_iso_field(choice.grid, iso, inside, run)?;
+    let level_set = rebuild(&field, &Rebuild::band(half_width(field.voxel_size())), run)?;
     if level_set.is_empty() {
-        return Err(EditError::input(path, format!("no voxel holds more than {iso}: there is no surface")));
+        return Err(no_surface());
     }
     Ok(Some(Input { path: path.to_path_buf(), level_set, source: Some((volume, None)), attributes: None }))
 }

@@ -5,12 +5,14 @@
 //! in [`REGISTRY`] and knows nothing of any one of them.
 
 pub mod compare;
+mod confine;
 pub mod csg;
 mod curvature;
 pub mod distance;
 pub mod morphology;
 mod params;
 mod registry;
+pub mod segment;
 mod sequence;
 pub mod shape;
 pub mod smooth;

@@ -219,6 +219,7 @@ impl Entry {
 /// All operators, in the order of the manual.
 pub static REGISTRY: &[Entry] = &[
     Entry::of::<super::shape::Shape>(),
+    Entry::of::<super::segment::Segment>(),
     Entry::of::<super::transform::TransformOperator>(),
     Entry::of::<super::csg::Csg>(),
     Entry::of::<super::smooth::Smooth>(),

@@ -15,6 +15,7 @@ mod rest;
 mod sharpen;
 mod speed;
 mod step;
+mod threshold;
 mod track;
 mod tracker;
 
@@ -26,6 +27,7 @@ pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
 pub use sharpen::sharpen;
 pub use speed::SpeedFunction;
+pub use threshold::grow_by_threshold;
 pub use track::track;
 pub use tracker::Tracker;
 
