@@ -121,7 +121,9 @@ impl Running<'_> {
                 let inputs = self.take(planned, true, &mut warnings)?;
                 // As a command would: the first `.vdb` is the one to be carried over, and what a step made would have been one.
                 let source = inputs.iter().find(|slot| !slot.is_mesh).and_then(|slot| slot.source.clone());
-                let attributes = inputs.iter().flat_map(|slot| slot.attributes.clone()).collect();
+                let mut attributes: Vec<_> = inputs.iter().flat_map(|slot| slot.attributes.clone()).collect();
+                attributes.sort();
+                attributes.dedup();
                 let level_sets = inputs.into_iter().map(|slot| slot.level_set).collect();
                 let Outcome { level_set, summary } = entry.run(values.clone(), level_sets, self.run)?;
                 (Some(Slot { level_set, source, attributes, is_mesh: false }), summary)
