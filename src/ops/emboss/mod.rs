@@ -41,29 +41,36 @@ use crate::run::RunOptions;
 pub struct Emboss {
     /// Draw the surface to the points of this file: lines of `x y z`, or the vertices of a mesh. Points inside engrave.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub points: Option<PathBuf>,
     /// Draw it to a curve: a text of points in order, the `l` lines of an OBJ, or the paths of an SVG, which are laid on the surface by `at`, `up`, `size` and `height`.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub curve: Option<PathBuf>,
     /// Draw it to the surface of this mesh or level set.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub mesh: Option<PathBuf>,
     /// Draw it to this solid, a mesh or level set: what lies inside of it already is not drawn.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub solid: Option<PathBuf>,
     /// Stamp this PNG: brightness is height.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub image: Option<PathBuf>,
     /// With `image`: dark is high.
     pub invert: bool,
     /// Stamp what the paths of this SVG fill, and its strokes.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub svg: Option<PathBuf>,
     /// Stamp this text; `font` says how. Line breaks centre lines below each other.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub text: Option<String>,
     /// The TrueType or OpenType font of `text`.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub font: Option<PathBuf>,
     /// Where the middle of a stamp goes; the closest point of the surface is taken.
     #[serde(skip_serializing_if = "Option::is_none")]
