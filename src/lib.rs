@@ -54,6 +54,7 @@
 //! | `vdb` | OpenVDB files and OpenVDB's own tools as a reference (feature `openvdb`) |
 //! | [`render`] | pictures |
 //! | [`ops`] | the operators and their registry |
+//! | [`recipe`] | whole editing sessions from TOML files |
 //! | `crosscheck` | our operators beside OpenVDB's, timed and compared (feature `openvdb`) |
 //! | `cli` | the command (feature `cli`) |
 //!
@@ -79,6 +80,7 @@ pub mod levelset;
 pub mod mesh;
 pub mod ops;
 pub mod pde;
+pub mod recipe;
 pub mod region;
 pub mod render;
 pub mod run;

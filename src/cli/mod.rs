@@ -20,6 +20,7 @@ mod preview;
 mod progress;
 mod render;
 mod report;
+mod run;
 mod signal;
 mod size;
 mod table;
@@ -50,6 +51,8 @@ const VERBS: &[Verb] = &[
     render::VERB,
     #[cfg(feature = "openvdb")]
     crosscheck::VERB,
+    run::VERB,
+    run::SCHEMA,
     completions::COMPLETIONS,
     completions::MAN,
 ];

@@ -191,6 +191,7 @@ impl Kind {
             Self::Length => "LENGTH".into(),
             Self::Numbers if parameter.kind == "array" => "A,B".into(),
             Self::Numbers => "X,Y,Z".into(),
+            Self::Text if parameter.kind == "FILE" => "FILE".into(),
             Self::Flag | Self::Words(_) | Self::Text => "TEXT".into(),
         }
     }

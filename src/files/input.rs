@@ -380,14 +380,19 @@ fn valid(
         }
         warnings.push(format!("{name}: {said}"));
     }
-    if level_set.half_width() < NARROWEST && !level_set.is_empty() {
-        warnings.push(format!(
-            "{name}: its band of {:.2} voxels is too narrow to be edited: rebuilt from its surface with {DEFAULT_HALF_WIDTH}",
-            level_set.half_width()
-        ));
-        return rebuilt(&level_set, run);
+    wide_enough(&name, level_set, warnings, run)
+}
+
+/// A level set in a band that is wide enough to be edited; `name` is what a warning calls it.
+pub fn wide_enough(name: &str, level_set: LevelSet, warnings: &mut Vec<String>, run: &RunOptions) -> Result<LevelSet> {
+    if level_set.half_width() >= NARROWEST || level_set.is_empty() {
+        return Ok(level_set);
     }
-    Ok(level_set)
+    warnings.push(format!(
+        "{name}: its band of {:.2} voxels is too narrow to be edited: rebuilt from its surface with {DEFAULT_HALF_WIDTH}",
+        level_set.half_width()
+    ));
+    rebuilt(&level_set, run)
 }
 
 /// Whether so much is wrong that the values cannot be taken for distances.

@@ -49,36 +49,67 @@ pub struct MeshParams {
     pub attributes_from: Option<PathBuf>,
 }
 
-impl MeshOptions {
-    /// For a mesh at `path`: refused if that is no mesh, or cannot hold what is asked.
-    pub fn new(params: &MeshParams, path: &Path) -> Result<Self> {
-        let faces = match (params.simplify, params.adaptivity) {
+impl MeshParams {
+    fn faces(&self) -> Faces {
+        match (self.simplify, self.adaptivity) {
             (Some(ratio), _) => Faces::Part(ratio),
             (None, Some(voxels)) => Faces::Within(voxels),
-            (None, None) if params.quads => Faces::Quads,
+            (None, None) if self.quads => Faces::Quads,
             (None, None) => Faces::All,
+        }
+    }
+
+    /// Refuses numbers that cannot work, and several ways of having fewer faces at once.
+    pub fn validate(&self) -> Result<()> {
+        let refuse = |field: &str, value: f64, accepted: &str| {
+            Err(EditError::parameter("write", field, value, accepted.to_owned()))
         };
-        let source = params.attributes_from.clone();
+        match (self.simplify, self.adaptivity, self.quads) {
+            (Some(ratio), ..) if !(ratio > 0.0 && ratio <= 1.0) => refuse("simplify", ratio, "a part above 0, up to 1"),
+            (_, Some(voxels), _) if !(0.0..=1.0).contains(&voxels) => {
+                refuse("adaptivity", voxels, "a number of voxels from 0 to 1")
+            }
+            (Some(ratio), Some(_), _) | (Some(ratio), _, true) => {
+                refuse("simplify", ratio, "one of `simplify`, `adaptivity` and `quads`")
+            }
+            (_, Some(voxels), true) => refuse("adaptivity", voxels, "one of `simplify`, `adaptivity` and `quads`"),
+            _ => Ok(()),
+        }
+    }
+
+    /// Refuses what a file at `path` cannot hold.
+    pub fn fits(&self, path: &Path) -> Result<()> {
         let format = MeshFormat::of(path);
         let refuse = |field: &str, value: String, accepted: &str| {
             Err(EditError::parameter("vdb-edit", field, value, accepted.to_owned()))
         };
         let is_mesh = format.is_some() && !input::is_volume(path);
         let accepted = "an output that is a mesh (.obj, .ply, .stl, .glb, .gltf or .off)";
-        match faces {
+        match self.faces() {
             Faces::Part(ratio) if !is_mesh => return refuse("simplify", ratio.to_string(), accepted),
             Faces::Within(voxels) if !is_mesh => return refuse("adaptivity", voxels.to_string(), accepted),
             Faces::Quads if !is_mesh => return refuse("quads", "true".into(), accepted),
             _ => {}
         }
-        let mut warnings = Vec::new();
-        let attributes = match source {
-            None => None,
+        match &self.attributes_from {
             Some(source) if !is_mesh || format.is_some_and(|format| !format.has_attributes()) => {
                 let accepted =
                     "an output that can hold colours and texture coordinates (.obj, .ply, .glb, .gltf or .off)";
-                return refuse("attributes_from", source.display().to_string(), accepted);
+                refuse("attributes_from", source.display().to_string(), accepted)
             }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl MeshOptions {
+    /// For a mesh at `path`: refused if that is no mesh, or cannot hold what is asked.
+    pub fn new(params: &MeshParams, path: &Path) -> Result<Self> {
+        params.fits(path)?;
+        let faces = params.faces();
+        let mut warnings = Vec::new();
+        let attributes = match params.attributes_from.clone() {
+            None => None,
             Some(source) => {
                 let mesh = input::read_mesh(&source, &mut warnings)?;
                 if attributes_of(&mesh).is_none() {

@@ -24,7 +24,7 @@ pub struct Output {
 
 /// What it will hold.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Kind {
+pub enum Kind {
     Volume,
     Mesh,
 }
@@ -55,10 +55,16 @@ pub struct Written {
 impl Output {
     /// An output that is refused now if it could not be written later.
     pub fn plan(path: PathBuf, options: VolumeOptions, mesh: &MeshParams) -> Result<Self> {
-        let kind = kind_of(&path)?;
-        writable(&path)?;
+        let kind = Self::check(&path)?;
         let mesh = MeshOptions::new(mesh, &path)?;
         Ok(Self { path, kind, options, mesh })
+    }
+
+    /// What a file at `path` would hold; refused if none can be written there.
+    pub fn check(path: &Path) -> Result<Kind> {
+        let kind = kind_of(path)?;
+        writable(path)?;
+        Ok(kind)
     }
 
     /// How meshes are written.

@@ -25,8 +25,9 @@ pub mod transform;
 pub mod warp;
 
 pub use curvature::{CurvatureOptions, Preset};
+pub(crate) use params::words;
 pub use params::{Vector, VoxelLength, WorldLength};
-pub use registry::{Arity, Entry, Operator, Outcome, Parameter, ParameterSet, REGISTRY, Summary, find};
 pub(crate) use registry::parse;
+pub use registry::{Arity, Entry, Operator, Outcome, Parameter, ParameterSet, REGISTRY, Summary, find};
 pub use sequence::{Sequence, SequenceOption};
 pub use solver::{EvolutionOptions, Like, RegionSpecs, Scheme};

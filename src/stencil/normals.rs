@@ -11,7 +11,7 @@
 //! turns an error of order h² into one of order h.
 //!
 //! A grid resolves no radius below a voxel: κ and H are clamped to ±1/h. Where |∇φ| < 0.1 (medial axis, flat parts) there is no
-//! normal and all curvatures are 0.
+//! normal and all curvatures are 0, but for peaks of φ: they are ±1/h, so that a flow does not leave specks of a voxel behind.
 
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 
@@ -94,6 +94,13 @@ pub fn curvatures<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, voxel_size:
 
     // dx, dy and dz are twice the central differences.
     let steep = (dx * dx + dy * dy + dz * dz).simd_gt(4.0 * FLAT_SQUARED * voxel_size * voxel_size);
+    // Where φ rises to all sides there is no normal either, but a speck of a voxel, as round as a grid can hold one; where it
+    // falls to all sides, a hole.
+    let (least_turn, largest_turn) = (xx.min(yy).min(zz), xx.max(yy).max(zz));
+    let peak = |turn: Lanes<S>| {
+        let speck = least_turn.simd_gt(1.0).select(one, zero);
+        steep.select(turn, largest_turn.simd_lt(-1.0).select(-one, speck))
+    };
     let scale = 1.0 / voxel_size;
     let mut reach = c.abs();
     for v in [xm, xp, ym, yp, zm, zp, xyp, xym, xmyp, xmym, xzp, xzm, xmzp, xmzm, yzp, yzm, ymzp, ymzm] {
@@ -101,10 +108,10 @@ pub fn curvatures<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize, voxel_size:
     }
     Curvatures {
         reach,
-        mean: steep.select(mean.min(one).max(-one) * scale, zero),
-        gaussian: steep.select(max * min * (scale * scale), zero),
-        max: steep.select(max * scale, zero),
-        min: steep.select(min * scale, zero),
+        mean: peak(mean.min(one).max(-one)) * scale,
+        gaussian: peak(max) * peak(min) * (scale * scale),
+        max: peak(max) * scale,
+        min: peak(min) * scale,
     }
 }
 
@@ -257,7 +264,10 @@ mod tests {
     fn the_numbers_of_torus_ellipsoid_saddle_and_crease() {
         let near = |got: [f64; 4], expected: [f64; 4], tolerance: f64| {
             for k in 0..4 {
-                assert!((got[k] - expected[k]).abs() < tolerance * expected[2].abs().max(expected[3].abs()).max(1.0), "{k}: {got:?} {expected:?}");
+                assert!(
+                    (got[k] - expected[k]).abs() < tolerance * expected[2].abs().max(expected[3].abs()).max(1.0),
+                    "{k}: {got:?} {expected:?}"
+                );
             }
         };
         let torus = |p: DVec3| (p.x.hypot(p.y) - 0.9).hypot(p.z) - 0.4;
@@ -267,7 +277,11 @@ mod tests {
         near(at_point(h, DVec3::X * 0.5, &torus), [0.25, -5.0, 2.5, -2.0], 0.003);
         // An ellipsoid at the end of its first axis, a/b² and a/c²; its quadratic is no distance, with a slope of 2 there.
         let axes = DVec3::new(1.0, 0.7, 0.5);
-        near(at_point(h, DVec3::X, &|p| ((p / axes).length_squared() - 1.0) / 2.0), [3.0204, 8.163, 4.0, 2.0408], 0.003);
+        near(
+            at_point(h, DVec3::X, &|p| ((p / axes).length_squared() - 1.0) / 2.0),
+            [3.0204, 8.163, 4.0, 2.0408],
+            0.003,
+        );
         for radius in [0.5, 1.0, 2.0] {
             let saddle = at_point(h, DVec3::ZERO, &|p| p.z - (p.x * p.x - p.y * p.y) / (2.0 * radius));
             near(saddle, [0.0, -1.0 / (radius * radius), 1.0 / radius, -1.0 / radius], 0.003);
@@ -361,6 +375,17 @@ mod tests {
             } else if (p.x - p.y).abs() < 0.01 {
                 assert!(got[2] > 10.0 && got[0] > 5.0, "{got:?}");
             }
+        }
+        // The centre of a speck, and that of a hole, is as round as can be; the axis of a cylinder is not round at all.
+        let at = DVec3::splat(0.15);
+        for sign in [1.0, -1.0] {
+            let all = measured(h, &|p| sign * ((p - at).length() - 0.03));
+            let got = all[positions(0.05).position(|p| (p - at).length() < 1e-6).unwrap()];
+            let k = 1.0 / 0.05 * sign;
+            assert!(near(got[0], k, 1e-4) && near(got[1], 400.0, 1e-2) && near(got[2], k, 1e-4), "{got:?}");
+            let all = measured(h, &|p| sign * ((p - at).truncate().length() - 0.03));
+            let axis = positions(0.05).zip(&all).filter(|(p, _)| (*p - at).truncate().length() < 1e-6);
+            assert!(axis.map(|(_, got)| got[0]).all(|mean| mean == 0.0));
         }
         // No gradient, no curvature.
         assert!(measured(h, &|_| 0.7).iter().all(|got| *got == [0.0; 5]));
