@@ -110,6 +110,13 @@ impl<'a> Sampler<'a> {
         DVec3::new(along(DVec3::X), along(DVec3::Y), along(DVec3::Z)) / (2.0 * self.voxel_size)
     }
 
+    /// Gradient of a voxel by central differences. Index axes, dimensionless.
+    pub fn voxel_gradient(&mut self, ijk: IVec3) -> DVec3 {
+        let mut along =
+            |axis: IVec3| f64::from(self.accessor.value(ijk + axis)) - f64::from(self.accessor.value(ijk - axis));
+        DVec3::new(along(IVec3::X), along(IVec3::Y), along(IVec3::Z)) / (2.0 * self.voxel_size)
+    }
+
     /// The surface point closest to an index-space position within the band, by Newton's iteration
     /// x ← x − φ ∇φ/|∇φ|²; `None` where the field has no gradient or the iteration leaves the band.
     /// On a distance field two or three steps reach the accuracy of the interpolation.

@@ -86,7 +86,7 @@ pub struct Emboss {
     pub height: Option<WorldLength>,
     /// Cosines of the angle between the normal and the direction to the target between which the surface begins to be drawn.
     pub angle_limits: [f64; 2],
-    /// Distance from the target within which the surface is drawn whatever its angle; 0 for the angles alone, with which a single point is not reached.
+    /// Distance from the target within which all of the surface that does not face away is drawn; 0 for the angles alone, with which a single point is not reached.
     pub tip: VoxelLength,
     /// Push the surface away from the target instead, for `time`, `iterations` or down to `max_depth`.
     pub repel: bool,
