@@ -13,6 +13,7 @@ mod convert;
 #[cfg(feature = "openvdb")]
 mod crosscheck;
 mod edit;
+mod geodesic;
 mod info;
 mod input;
 mod mesh_output;
@@ -54,6 +55,7 @@ const VERBS: &[Verb] = &[
     info::VERB,
     convert::VERB,
     compare::VERB,
+    geodesic::VERB,
     render::VERB,
     #[cfg(feature = "openvdb")]
     crosscheck::VERB,

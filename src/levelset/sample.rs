@@ -55,6 +55,11 @@ impl<'a> Sampler<'a> {
         Self { accessor: level_set.grid().accessor(), level_set }
     }
 
+    /// Edge of a voxel in world units.
+    pub(super) fn voxel_size(&self) -> f64 {
+        self.level_set.voxel_size()
+    }
+
     /// Value of a voxel.
     pub fn voxel(&mut self, ijk: IVec3) -> f32 {
         self.accessor.value(ijk)

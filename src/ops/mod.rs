@@ -13,6 +13,7 @@ mod params;
 mod registry;
 pub mod shape;
 pub mod smooth;
+pub mod smooth_csg;
 mod solver;
 pub mod transform;
 

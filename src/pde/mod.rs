@@ -4,6 +4,7 @@
 //! |∇φ| = 1; [`track`] lets the band follow
 //! the surface: dilate, renormalise, trim. A [`Tracker`] does these steps one by one.
 
+mod anisotropic;
 mod curvature_flow;
 mod domain;
 mod evolve;
@@ -16,6 +17,7 @@ mod step;
 mod track;
 mod tracker;
 
+pub use anisotropic::{AnisotropicGaussian, filter_anisotropic};
 pub use curvature_flow::FlowCurvature;
 pub use evolve::{Report, StopReason, Until, evolve};
 pub use filter::{Filter, FilterKind, filter, offset};

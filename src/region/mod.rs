@@ -8,6 +8,7 @@ mod files;
 mod near;
 mod plan;
 mod primitive;
+mod voxels;
 mod weights;
 
 use glam::DVec3;
@@ -16,6 +17,7 @@ pub use field::{Inside, Painted, Part};
 pub use near::Near;
 pub use plan::RegionPlan;
 pub use primitive::{HalfSpace, Primitive, Shape};
+pub use voxels::VoxelSet;
 pub use weights::RegionWeights;
 
 /// A weight in space.
