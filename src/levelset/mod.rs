@@ -9,6 +9,7 @@ mod components;
 mod curvature;
 mod curve;
 pub(crate) mod dual;
+pub mod expression;
 mod field;
 mod geodesic;
 pub(crate) mod isosurface;

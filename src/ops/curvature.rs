@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::params::words;
 use crate::error::{EditError, Result};
-use crate::pde::{CutOff, Direction, FlowCurvature};
+use crate::pde::{CurvatureFlow, CutOff, Direction, FlowCurvature};
 
 words! {
     /// Settings of the examples of Museth et al. 2002, table 4.
@@ -83,17 +83,9 @@ pub struct CurvatureOptions {
 /// A sphere of this curvature, in 1/voxel, has a radius of two voxels: below that a grid does not hold a surface reliably.
 const RESOLVED: f64 = 0.5;
 
-/// What drives a flow by curvature.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Drive {
-    pub curvature: FlowCurvature,
-    pub cut_off: CutOff,
-    pub direction: Direction,
-}
-
 impl CurvatureOptions {
     /// What was asked for, over the preset, over `own`, the operator's defaults. Refuses what cannot work.
-    pub(super) fn drive(&self, operation: &str, own: Drive) -> Result<Drive> {
+    pub fn flow(&self, operation: &str, own: CurvatureFlow) -> Result<CurvatureFlow> {
         let ([mut low, mut high], mut direction) = ([own.cut_off.low(), own.cut_off.high()], own.direction);
         if let Some(preset) = self.preset {
             preset.validate(operation)?;
@@ -125,52 +117,60 @@ impl CurvatureOptions {
             cut_off = cut_off.with_high(limits).map_err(refuse("curvature_high", limits))?;
         }
         let curvature = self.curvature.unwrap_or(own.curvature);
-        Ok(Drive { curvature, cut_off, direction: self.direction.unwrap_or(direction) })
+        Ok(CurvatureFlow { curvature, cut_off, direction: self.direction.unwrap_or(direction) })
     }
 }
 
-impl Drive {
-    /// What to tell the user of limits that no grid resolves.
-    pub fn warning(&self) -> Option<String> {
-        let largest =
-            [self.cut_off.low(), self.cut_off.high()].into_iter().flatten().map(|[_, b]| b).fold(0.0, f64::max);
-        (largest > RESOLVED).then(|| {
-            format!(
-                "a curvature limit of {largest} per voxel is beyond what the grid resolves: a radius of two voxels, {RESOLVED}"
-            )
-        })
+impl CurvatureOptions {
+    /// The error for options that have no use here: they belong `where_to`.
+    pub(super) fn misplaced(&self, operation: &str, where_to: &str) -> EditError {
+        let (field, value) = match serde_json::to_value(self) {
+            Ok(serde_json::Value::Object(given)) => given.into_iter().next().unwrap_or_default(),
+            _ => Default::default(),
+        };
+        EditError::parameter(operation, &field, value, format!("only {where_to}"))
     }
+}
+
+/// What to tell the user of limits that no grid resolves.
+pub(super) fn unresolved(cut_off: &CutOff) -> Option<String> {
+    let largest = [cut_off.low(), cut_off.high()].into_iter().flatten().map(|[_, b]| b).fold(0.0, f64::max);
+    (largest > RESOLVED).then(|| {
+        format!(
+            "a curvature limit of {largest}/voxel is beyond what the grid resolves, {RESOLVED} (a radius of two voxels)"
+        )
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const OWN: Drive = Drive { curvature: FlowCurvature::Mean, cut_off: CutOff::NONE, direction: Direction::Both };
+    const OWN: CurvatureFlow = CurvatureFlow::MEAN;
 
     #[test]
     fn what_is_given_goes_before_the_preset_before_the_default() {
-        let sharp = Drive { cut_off: CutOff::NONE.with_high([0.15, 0.25]).unwrap(), ..OWN };
+        let sharp = CurvatureFlow { cut_off: CutOff::NONE.with_high([0.15, 0.25]).unwrap(), ..OWN };
         let hair = CurvatureOptions { preset: Some(Preset::HairSharpening), ..Default::default() };
-        let drive = hair.drive("sharpen", sharp).unwrap();
-        assert_eq!((drive.cut_off.low(), drive.cut_off.high()), (Some([0.01, 0.013]), Some([0.8, 0.9])));
-        assert!(drive.warning().unwrap().contains("0.9"));
+        let flow = hair.flow("sharpen", sharp).unwrap();
+        assert_eq!((flow.cut_off.low(), flow.cut_off.high()), (Some([0.01, 0.013]), Some([0.8, 0.9])));
+        assert!(unresolved(&flow.cut_off).unwrap().contains("0.9"));
         let mine = CurvatureOptions { curvature_high: Some([0.1, 0.2]), direction: Some(Direction::Add), ..hair };
-        let drive = mine.drive("sharpen", sharp).unwrap();
-        assert_eq!((drive.cut_off.low(), drive.cut_off.high()), (Some([0.01, 0.013]), Some([0.1, 0.2])));
-        assert_eq!((drive.direction, drive.warning()), (Direction::Add, None));
-        assert_eq!(CurvatureOptions::default().drive("sharpen", sharp).unwrap(), sharp);
+        let flow = mine.flow("sharpen", sharp).unwrap();
+        assert_eq!((flow.cut_off.low(), flow.cut_off.high()), (Some([0.01, 0.013]), Some([0.1, 0.2])));
+        assert_eq!((flow.direction, unresolved(&flow.cut_off)), (Direction::Add, None));
+        assert_eq!(CurvatureOptions::default().flow("sharpen", sharp).unwrap(), sharp);
         // A lower limit above the default's upper ones stands alone.
         let low = CurvatureOptions { curvature_low: Some([0.2, 0.3]), ..Default::default() };
-        assert_eq!(low.drive("sharpen", sharp).unwrap().cut_off.high(), None);
+        assert_eq!(low.flow("sharpen", sharp).unwrap().cut_off.high(), None);
     }
 
     #[test]
     fn presets_belong_to_their_operators_and_limits_have_an_order() {
         let refused =
-            |operation: &str, options: CurvatureOptions| options.drive(operation, OWN).unwrap_err().to_string();
+            |operation: &str, options: CurvatureOptions| options.flow(operation, OWN).unwrap_err().to_string();
         let wing = CurvatureOptions { preset: Some(Preset::WingBlend), ..Default::default() };
-        assert!(wing.drive("blend", OWN).is_ok() && refused("smooth", wing).contains("only with `blend`"));
+        assert!(wing.flow("blend", OWN).is_ok() && refused("smooth", wing).contains("only with `blend`"));
         let crossed = CurvatureOptions { curvature_low: Some([0.06, 0.04]), ..Default::default() };
         assert!(refused("smooth", crossed).contains("curvature_low = 0.06,0.04"));
         let crossed = CurvatureOptions {

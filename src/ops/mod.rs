@@ -5,12 +5,15 @@
 //! in [`REGISTRY`] and knows nothing of any one of them.
 
 pub mod compare;
+mod confine;
 pub mod csg;
 mod curvature;
 pub mod distance;
 pub mod morphology;
 mod params;
 mod registry;
+pub mod segment;
+mod sequence;
 pub mod shape;
 pub mod smooth;
 pub mod smooth_csg;
@@ -18,6 +21,9 @@ mod solver;
 pub mod transform;
 
 pub use curvature::{CurvatureOptions, Preset};
+pub(crate) use params::words;
 pub use params::{Vector, VoxelLength, WorldLength};
-pub use registry::{Arity, Entry, Operator, Outcome, Parameter, REGISTRY, Summary, find};
+pub(crate) use registry::parse;
+pub use registry::{Arity, Entry, Operator, Outcome, Parameter, ParameterSet, REGISTRY, Summary, find};
+pub use sequence::{Sequence, SequenceOption};
 pub use solver::{EvolutionOptions, Like, RegionSpecs, Scheme};

@@ -30,7 +30,7 @@ pub(super) fn level_set(
 }
 
 /// The numbers of a grid of a `.vdb` file.
-pub(super) fn volume(path: &Path, grid: Option<&str>, run: &RunOptions) -> Result<Volume> {
+pub(crate) fn volume(path: &Path, grid: Option<&str>, run: &RunOptions) -> Result<Volume> {
     volumes::volume(path, grid, run)
 }
 
