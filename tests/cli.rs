@@ -351,9 +351,11 @@ fn volumes_become_level_sets_at_a_value() {
 #[test]
 fn scans_become_level_sets() {
     let desk = Desk::new();
-    let mut text = String::from("NRRD0004\ntype: float\ndimension: 3\nsizes: 32 32 17\nspacings: 0.5 0.5 1\nencoding: text\n\n");
+    let mut text =
+        String::from("NRRD0004\ntype: float\ndimension: 3\nsizes: 32 32 17\nspacings: 0.5 0.5 1\nencoding: text\n\n");
     for i in 0..32 * 32 * 17 {
-        let p = DVec3::new(f64::from(i % 32) - 15.5, f64::from(i / 32 % 32) - 15.5, 2.0 * f64::from(i / 1024) - 16.0) * 0.5;
+        let p =
+            DVec3::new(f64::from(i % 32) - 15.5, f64::from(i / 32 % 32) - 15.5, 2.0 * f64::from(i / 1024) - 16.0) * 0.5;
         text += &format!("{:.4} ", 100.0 - 10.0 * p.length());
     }
     std::fs::write(desk.path("scan.nrrd"), &text).unwrap();
@@ -362,7 +364,8 @@ fn scans_become_level_sets() {
     assert!((found["volume_after"].as_f64().unwrap() / volume - 1.0).abs() < 0.03, "{found}");
     assert!(found["warnings"][0].as_str().unwrap().contains("resampled"), "{found}");
     assert_eq!(found["voxel_size"], 0.5);
-    let segmented = desk.done(&["segment", "scan.nrrd", "-o", "b.ply", "--iso", "50", "--smoothness", "0.1", "--json"]).json();
+    let segmented =
+        desk.done(&["segment", "scan.nrrd", "-o", "b.ply", "--iso", "50", "--smoothness", "0.1", "--json"]).json();
     assert!((segmented["volume_after"].as_f64().unwrap() / volume - 1.0).abs() < 0.03, "{segmented}");
     let hollow = desk.done(&["convert", "scan.nrrd", "-o", "c.vdb", "--iso", "50", "--invert", "--json"]).json();
     assert!(hollow["volume_after"].as_f64().unwrap() > 2.0 * volume);
@@ -392,7 +395,8 @@ fn solids_combine() {
     );
     assert!(smooth > 1.01 * sharp, "{smooth} {sharp}");
     desk.run(&["shape", "union(sphere radius=1)", "-o", "b.vdb"]).fails(2, &["two or more"]);
-    desk.run(&["shape", "intersection(sphere radius=1, sphere radius=1 center=5,0,0)", "-o", "b.vdb"]).fails(2, &["overlap"]);
+    desk.run(&["shape", "intersection(sphere radius=1, sphere radius=1 center=5,0,0)", "-o", "b.vdb"])
+        .fails(2, &["overlap"]);
     assert_eq!(desk.names(), ["a.vdb"]);
 }
 

@@ -87,9 +87,8 @@ const OUT: &str = "[[step]]\nop = \"write\"\ninput = \"ball\"\npath = \"out.vdb\
 fn bad_recipes_are_refused_with_line_and_remedy() {
     let desk = Desk::new();
     let write = |input: &str| format!("[[step]]\nop = \"write\"\ninput = \"{input}\"\npath = \"out.vdb\"\n");
-    let smooth = |keys: &str| {
-        format!("{BALL}[[step]]\nop = \"smooth\"\ninput = \"ball\"\nname = \"s\"\n{keys}\n{}", write("s"))
-    };
+    let smooth =
+        |keys: &str| format!("{BALL}[[step]]\nop = \"smooth\"\ninput = \"ball\"\nname = \"s\"\n{keys}\n{}", write("s"));
     // Line 2 is the first after the version; the ball has six lines, the keys of `smooth` begin in line 12.
     for (steps, code, words) in [
         // unknown keys, with line and nearest known key
@@ -110,7 +109,11 @@ fn bad_recipes_are_refused_with_line_and_remedy() {
         (smooth("region = \"spher radius=1\""), 2, &["r.toml:12:", "did you mean `sphere`"]),
         (smooth("region = \"mask file=nowhere.vdb\""), 3, &["nowhere.vdb", "r.toml:12:"]),
         (smooth("iterations = \"$n\""), 2, &["r.toml:12:", "`$n` is no variable"]),
-        (format!("[[step]]\nop = \"shape\"\nspec = \"sphere\"\nname = \"ball\"\n{OUT}"), 2, &["r.toml:4:", "needs `radius=`"]),
+        (
+            format!("[[step]]\nop = \"shape\"\nspec = \"sphere\"\nname = \"ball\"\n{OUT}"),
+            2,
+            &["r.toml:4:", "needs `radius=`"],
+        ),
         ("step = 3".into(), 2, &["[[step]]"]),
         (format!("set = 3\n{BALL}{OUT}"), 2, &["[set]"]),
         (format!("[set]\nF = 3\n{BALL}{OUT}"), 2, &["r.toml:3", "small letter"]),
@@ -118,20 +121,46 @@ fn bad_recipes_are_refused_with_line_and_remedy() {
         (BALL.replace("name = \"ball\"\n", ""), 2, &["r.toml:2: shape", "name = nothing"]),
         (format!("{BALL}{BALL}{OUT}"), 2, &["r.toml:7: shape `ball`", "line 2 has it already"]),
         (BALL.replace("\"ball\"", "\"a ball\""), 2, &["r.toml:6", "letters, digits"]),
-        (format!("{BALL}[[step]]\nop = \"assert\"\ninput = \"bal\"\ncomponents = 1\n"), 2, &["r.toml:9: assert", "did you mean `ball`"]),
+        (
+            format!("{BALL}[[step]]\nop = \"assert\"\ninput = \"bal\"\ncomponents = 1\n"),
+            2,
+            &["r.toml:9: assert", "did you mean `ball`"],
+        ),
         // circular, forward and unused
-        (format!("{BALL}{OUT}").replace("\"shape\"", "\"smooth\"").replace("spec = \"sphere radius=1\"", "input = \"ball\""), 2, &["circular"]),
+        (
+            format!("{BALL}{OUT}")
+                .replace("\"shape\"", "\"smooth\"")
+                .replace("spec = \"sphere radius=1\"", "input = \"ball\""),
+            2,
+            &["circular"],
+        ),
         (format!("{}{BALL}", write("ball")), 2, &["r.toml:4: write", "line 6", "circular"]),
         (BALL.into(), 2, &["r.toml:2: shape `ball`", "nothing uses"]),
         (format!("{BALL}{OUT}{}", BALL.replace("ball", "other")), 2, &["r.toml:11: shape `other`", "nothing uses"]),
         // inputs
         (format!("{BALL}{OUT}input = \"ball\""), 3, &["r.toml", "line 12"]),
         (format!("{BALL}{}", OUT.replace("input = \"ball\"\n", "")), 2, &["r.toml:7: write", "one input"]),
-        (format!("{BALL}[[step]]\nop = \"csg\"\ninput = \"ball\"\nname = \"u\"\n{}", write("u")), 2, &["r.toml:7: csg `u`", "two inputs"]),
+        (
+            format!("{BALL}[[step]]\nop = \"csg\"\ninput = \"ball\"\nname = \"u\"\n{}", write("u")),
+            2,
+            &["r.toml:7: csg `u`", "two inputs"],
+        ),
         (format!("{BALL}{}", OUT.replace("\"ball\"", "3")), 2, &["r.toml:9", "a text in quotes"]),
-        (format!("{BALL}[[step]]\nop = \"csg\"\ninputs = \"ball\"\nname = \"u\"\n{}", write("u")), 2, &["r.toml:9: csg `u`", "a list of names"]),
-        (format!("[[step]]\nop = \"convert\"\ninput = \"absent.obj\"\nname = \"a\"\n{}", write("a")), 3, &["absent.obj", "r.toml:2: convert `a`"]),
-        (format!("{BALL}[[step]]\nop = \"convert\"\ninput = \"ball\"\nname = \"a\"\n{}", write("a")), 2, &["a level set already"]),
+        (
+            format!("{BALL}[[step]]\nop = \"csg\"\ninputs = \"ball\"\nname = \"u\"\n{}", write("u")),
+            2,
+            &["r.toml:9: csg `u`", "a list of names"],
+        ),
+        (
+            format!("[[step]]\nop = \"convert\"\ninput = \"absent.obj\"\nname = \"a\"\n{}", write("a")),
+            3,
+            &["absent.obj", "r.toml:2: convert `a`"],
+        ),
+        (
+            format!("{BALL}[[step]]\nop = \"convert\"\ninput = \"ball\"\nname = \"a\"\n{}", write("a")),
+            2,
+            &["a level set already"],
+        ),
         // outputs
         (format!("{BALL}{}", OUT.replace("out.vdb", "nowhere/out.vdb")), 4, &["nowhere/out.vdb", "no folder"]),
         (format!("{BALL}{}", OUT.replace("out.vdb", "out.txt")), 2, &["r.toml:10: write", ".obj"]),
@@ -159,9 +188,16 @@ fn a_later_failure_leaves_nothing_of_what_was_written_before() {
     let desk = Desk::new();
     desk.write("out.vdb", "old");
     let assert = "[[step]]\nop = \"assert\"\ninput = \"ball\"\ncomponents = 2\nvolume = [4.1, 4.2]\ngenus = [1, 3]\n";
-    desk.fails(&format!("{BALL}{OUT}{assert}"), 1, &["r.toml:12: assert", "components is 1, not 2", "genus is 0, not within 1 to 3"]);
+    desk.fails(
+        &format!("{BALL}{OUT}{assert}"),
+        1,
+        &["r.toml:12: assert", "components is 1, not 2", "genus is 0, not within 1 to 3"],
+    );
     assert_eq!(std::fs::read(desk.path("out.vdb")).unwrap(), b"old");
-    let ended = desk.recipe(&format!("{BALL}{OUT}{assert}").replace("components = 2", "components = 1").replace("genus = [1, 3]", ""), &["--json"]);
+    let ended = desk.recipe(
+        &format!("{BALL}{OUT}{assert}").replace("components = 2", "components = 1").replace("genus = [1, 3]", ""),
+        &["--json"],
+    );
     let steps = &ended.json()["frames"][0]["steps"];
     assert_eq!((&steps[2]["op"], &steps[2]["components"]), (&"assert".into(), &1.into()));
     assert!(steps[2]["volume"].as_f64().is_some_and(|v| (4.1..4.2).contains(&v)), "{steps}");
@@ -308,7 +344,8 @@ fn keyframes_frames_and_patterns() {
     "#;
     let ended = desk.recipe(recipe, &["--frames", "1-5x2,2", "--json"]);
     assert_eq!(ended.code(), Some(0), "{}", ended.err);
-    let frames: Vec<i64> = ended.json()["frames"].as_array().unwrap().iter().map(|f| f["frame"].as_i64().unwrap()).collect();
+    let frames: Vec<i64> =
+        ended.json()["frames"].as_array().unwrap().iter().map(|f| f["frame"].as_i64().unwrap()).collect();
     assert_eq!(frames, [1, 3, 5, 2]);
     for (frame, radius, steps) in [(1, 0.5f64, 0), (2, 0.6, 1), (3, 0.7, 2), (5, 0.9, 3)] {
         let found = desk.done(&["info", &format!("moved.{frame:02}.vdb"), "--json"]).json()["grids"][0].clone();
@@ -319,7 +356,8 @@ fn keyframes_frames_and_patterns() {
         let lowest = found["bbox_world"][0][0].as_f64().unwrap();
         let expected = 0.5 * (f64::from(frame) - 1.0) - radius - 0.15;
         assert!((lowest - expected).abs() <= 0.1, "{frame}: {lowest} {expected}");
-        let smoothed = desk.done(&["smooth", &format!("moved.{frame:02}.vdb"), "-o", "s.vdb", "--iterations", &steps.to_string()]);
+        let smoothed =
+            desk.done(&["smooth", &format!("moved.{frame:02}.vdb"), "-o", "s.vdb", "--iterations", &steps.to_string()]);
         drop(smoothed);
         desk.same("s.vdb", &format!("a.{frame:04}.vdb"));
         let picture = png_size(&desk.path(&format!("b.{frame:03}.png")));
@@ -374,7 +412,9 @@ fn variables_are_set_and_dry_runs_write_nothing() {
     desk.done(&["run", "r.toml", "--set", "r=0.5", "--set", "name=1-2"]);
     let volume = desk.measure("1-2.vdb")["volume"].as_f64().unwrap();
     assert!((volume - 4.0 / 3.0 * std::f64::consts::PI * 0.125).abs() < 0.02, "{volume}");
-    for (set, part) in [("radius=1", "there are r, name"), ("r=[1,2,3]", "like that of the recipe"), ("r", "NAME=VALUE")] {
+    for (set, part) in
+        [("radius=1", "there are r, name"), ("r=[1,2,3]", "like that of the recipe"), ("r", "NAME=VALUE")]
+    {
         let ended = desk.run(&["run", "r.toml", "--set", set]);
         assert_eq!(ended.code(), Some(2), "{}", ended.err);
         assert!(ended.err.contains(part), "{}", ended.err);

@@ -172,7 +172,10 @@ fn smooth(run: &RunOptions) -> Result<()> {
 fn highest(level_set: &LevelSet) -> Result<String> {
     let grid = level_set.grid();
     let voxels = grid.leaves().iter().flat_map(|&id| {
-        grid.mask(id).iter().filter(move |at| grid.values(id).0[*at].abs() < 0.5).map(move |at| grid.origin(id) + offset_to_local(at))
+        grid.mask(id)
+            .iter()
+            .filter(move |at| grid.values(id).0[*at].abs() < 0.5)
+            .map(move |at| grid.origin(id) + offset_to_local(at))
     });
     let top = voxels.max_by_key(|v| (v.z, v.x, v.y)).ok_or("no surface")?;
     Ok(format!("{},{},{}", top.x, top.y, top.z))
@@ -227,6 +230,8 @@ fn box_and_torus(run: &RunOptions) -> Result<()> {
     let flow = ours("blend", json!({ "method": "curvature", "iterations": 30 }), &[&bar, &ring], run)?;
     print(&row, flow, Some(masked_flow(&united, region, 30, run)?));
     let ratio = flow[0] / filter?[0];
-    println!("\nOf the two methods, the flow takes {ratio:.1} times as long as the filter (thesis: 1851 s / 72 s = 25.7).");
+    println!(
+        "\nOf the two methods, the flow takes {ratio:.1} times as long as the filter (thesis: 1851 s / 72 s = 25.7)."
+    );
     Ok(())
 }

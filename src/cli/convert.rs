@@ -108,7 +108,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         Some(iso) => {
             let inside = if args::flag(matches, "invert") { Inside::Below } else { Inside::Above };
             input::load_iso(path, &input_options, iso as f32, inside, &mut warnings, &context.run)?
-        },
+        }
         None => None,
     };
     let is_volume = of_volume.is_some();

@@ -10,13 +10,14 @@ use glam::DVec3;
 use serde_json::{Map, json};
 
 use super::context::Context;
-use super::input::{self, InputOptions};
-use super::output::{Output, Written};
-use super::{Verb, args, edit, table, volume};
+use super::{Verb, args, edit, files, table};
 use crate::error::{EditError, Result};
+use crate::files::output::Written;
+use crate::files::{input, volume};
 use crate::levelset::Field;
 use crate::mesh::level_set_to_mesh;
 use crate::ops::Vector;
+use crate::render::distance_colors;
 
 /// The command.
 pub const VERB: Verb = Verb { name: "geodesic", build, run };
@@ -54,13 +55,13 @@ const OF_LEVEL_SETS: [&str; 6] = ["check", "preview", "only-result", "attributes
 fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let began = Instant::now();
     let paths: Vec<PathBuf> = args::paths(matches, "input");
-    let options = InputOptions::new(matches)?;
+    let options = files::input_options(matches)?;
     let given = |id: &&&str| matches.value_source(id) == Some(ValueSource::CommandLine);
     if let Some(id) = OF_LEVEL_SETS.iter().find(given) {
         let accepted = "only where a level set is written; this writes distances beside it";
         return Err(EditError::parameter(VERB.name, id, "given", accepted));
     }
-    let output = Output::plan(matches, context)?;
+    let output = files::output(matches, context)?;
     let from: Vec<DVec3> = matches.get_many::<Vector>("from").into_iter().flatten().map(|v| v.0).collect();
     if args::flag(matches, "dry-run") {
         let values =
@@ -69,7 +70,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     }
     let mut warnings = Vec::new();
     // The grid that the level set was read from is written as well.
-    let loaded = input::load_whole(&paths, &options, &mut warnings, context)?;
+    let loaded = input::load_whole(&paths, &options, &mut warnings, &context.run)?;
     let Some(input) = loaded.first() else { return Ok(()) };
     let found = input.level_set.geodesic(&from, &context.run)?;
     let field = reached(&found.field);
@@ -80,10 +81,8 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     }
     let Written { bytes, warnings: more, details } = if output.is_mesh() {
         let mut mesh = level_set_to_mesh(&input.level_set, 0.0, &context.run)?;
-        let to_index = |p: &DVec3| field.transform().world_to_index(*p);
-        let mut sample = Sampled(&field);
-        mesh.colors = Some(mesh.positions.iter().map(|p| color(sample.at(to_index(p)), farthest)).collect());
-        output.write_mesh(mesh, context)?
+        mesh.colors = Some(distance_colors(&mesh.positions, &field, farthest.into()));
+        output.write_mesh(mesh, &context.run)?
     } else {
         let to_write = volume::FieldToWrite { field: &field, name: GRID };
         let volume = input.from().map(|(volume, _)| volume);
@@ -122,61 +121,4 @@ fn reached(field: &Field) -> Field {
         }
     });
     Field::new(grid, *field.transform())
-}
-
-/// Reads a field between its active voxels.
-struct Sampled<'a>(&'a Field);
-
-impl Sampled<'_> {
-    /// Trilinear over those of the eight voxels around a position that have a value.
-    fn at(&mut self, ijk: DVec3) -> Option<f32> {
-        let mut voxels = self.0.accessor();
-        let (first, t) = (ijk.floor().as_ivec3(), ijk - ijk.floor());
-        let (mut sum, mut weights) = (0.0, 0.0);
-        for c in 0..8 {
-            let corner = glam::IVec3::new(c >> 2, c >> 1 & 1, c & 1);
-            let part = corner.as_dvec3() * t + (1.0 - corner.as_dvec3()) * (1.0 - t);
-            if voxels.is_active(first + corner) {
-                let weight = part.x * part.y * part.z;
-                sum += weight * f64::from(voxels.value(first + corner));
-                weights += weight;
-            }
-        }
-        (weights > 1e-6).then(|| (sum / weights) as f32)
-    }
-}
-
-/// sRGB stops of equal steps in lightness (viridis).
-const STOPS: [[f32; 3]; 5] =
-    [[0.267, 0.005, 0.329], [0.230, 0.322, 0.546], [0.128, 0.567, 0.551], [0.369, 0.789, 0.383], [0.993, 0.906, 0.144]];
-/// What cannot be reached.
-const GREY: [f32; 3] = [0.5; 3];
-
-/// The linear colour of a distance.
-fn color(distance: Option<f32>, farthest: f32) -> [f32; 4] {
-    let srgb = match distance {
-        None => GREY,
-        Some(distance) => {
-            let at = (distance / farthest.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0) * (STOPS.len() - 1) as f32;
-            let stop = (at as usize).min(STOPS.len() - 2);
-            let t = at - stop as f32;
-            std::array::from_fn(|i| STOPS[stop][i] + (STOPS[stop + 1][i] - STOPS[stop][i]) * t)
-        }
-    };
-    let [r, g, b] = srgb.map(|v| if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) });
-    [r, g, b, 1.0]
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn colours_run_from_dark_to_light() {
-        let light = |c: [f32; 4]| 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2];
-        let ramp: Vec<f32> = (0..=20).map(|i| light(color(Some(i as f32), 20.0))).collect();
-        assert!(ramp.windows(2).all(|w| w[1] > w[0]) && ramp[0] < 0.02 && ramp[20] > 0.7, "{ramp:?}");
-        assert_eq!(color(Some(3.0), 0.0), color(Some(1.0), 1.0));
-        assert_ne!(color(None, 1.0), color(Some(0.5), 1.0));
-    }
 }

@@ -88,7 +88,8 @@ impl CurvatureFile {
         let path = PathBuf::from(path);
         let is_mesh = MeshFormat::of(&path).is_some_and(MeshFormat::has_attributes);
         if input::is_pipe(&path) || !(is_mesh || input::is_volume(&path)) {
-            let accepted = "a file name that ends in .vdb, or one of a mesh with colours: .ply, .obj, .glb, .gltf, .off";
+            let accepted =
+                "a file name that ends in .vdb, or one of a mesh with colours: .ply, .obj, .glb, .gltf, .off";
             return refuse(&path.display().to_string(), accepted.into());
         }
         if inputs.len() != 1 || inputs.iter().any(|input| input::is_pipe(input)) {

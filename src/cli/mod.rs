@@ -13,11 +13,8 @@ mod convert;
 #[cfg(feature = "openvdb")]
 mod crosscheck;
 mod edit;
-<<<<<<< HEAD
-mod geodesic;
-=======
 mod files;
->>>>>>> main
+mod geodesic;
 mod info;
 mod options;
 mod preview;

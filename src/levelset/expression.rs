@@ -58,10 +58,12 @@ impl Expression {
         if depth == DEEPEST {
             return Err(refuse(format!("up to {DEEPEST} levels of parentheses")));
         }
-        let inner = text[open + 1..].strip_suffix(')').ok_or_else(|| refuse("a closing parenthesis at its end".into()))?;
+        let inner =
+            text[open + 1..].strip_suffix(')').ok_or_else(|| refuse("a closing parenthesis at its end".into()))?;
         let pieces = pieces(inner).ok_or_else(|| refuse("parentheses and double quotes in pairs".into()))?;
         // Parts begin with a kind, options with a key.
-        let is_option = |piece: &&str| piece.split(['=', ' ', '(']).next().is_some_and(|word| piece[word.len()..].starts_with('='));
+        let is_option =
+            |piece: &&str| piece.split(['=', ' ', '(']).next().is_some_and(|word| piece[word.len()..].starts_with('='));
         let (options, parts): (Vec<&str>, Vec<&str>) = pieces.into_iter().partition(is_option);
         let form = form(name, &options)?;
         if smooth != form.is_some() {
@@ -150,7 +152,9 @@ fn form(name: &str, options: &[&str]) -> Result<Option<BlendForm>> {
     let spec = Spec::parse("shape", &format!("{name} {}", options.join(" ")))?;
     let exponent = spec.number("exponent")?;
     let form = match spec.text("function").unwrap_or("superelliptic") {
-        "superelliptic" => BlendForm::SuperElliptic { radius: spec.length("radius")?, exponent: exponent.unwrap_or(2.0) },
+        "superelliptic" => {
+            BlendForm::SuperElliptic { radius: spec.length("radius")?, exponent: exponent.unwrap_or(2.0) }
+        }
         "exponential" => BlendForm::Exponential { radius: spec.length("radius")? },
         "hyperbolic" => BlendForm::Hyperbolic { radius: spec.length("radius")? },
         "r" => {
@@ -160,7 +164,9 @@ fn form(name: &str, options: &[&str]) -> Result<Option<BlendForm>> {
             }
             BlendForm::R { alpha: spec.number("alpha")?.unwrap_or(0.0), order: order as u32 }
         }
-        other => return Err(spec.refuse(suggest(other, ["superelliptic", "exponential", "hyperbolic", "r"].into_iter()))),
+        other => {
+            return Err(spec.refuse(suggest(other, ["superelliptic", "exponential", "hyperbolic", "r"].into_iter())));
+        }
     };
     spec.finish()?;
     form.validate("shape")?;
@@ -272,6 +278,11 @@ mod tests {
         }
         let deep = format!("{}sphere radius=1{}", "union(sphere radius=1, ".repeat(80), ")".repeat(80));
         assert!(Expression::parse(&deep).err().unwrap().to_string().contains("levels"));
-        assert!(Expression::parse("intersection(sphere radius=1, sphere center=9,0,0 radius=1)").unwrap().bounds().is_none());
+        assert!(
+            Expression::parse("intersection(sphere radius=1, sphere center=9,0,0 radius=1)")
+                .unwrap()
+                .bounds()
+                .is_none()
+        );
     }
 }

@@ -97,7 +97,8 @@ impl BezierPatches {
     pub fn tessellate(&self, tolerance: f64, run: &RunOptions) -> Result<TriangleMesh> {
         let segments: Vec<[f64; 2]> = self.patches.iter().map(|patch| patch.segments(tolerance / STRIP)).collect();
         if let Some(most) = segments.iter().flatten().copied().find(|n| !(*n <= MOST_SEGMENTS)) {
-            let accepted = format!("a tolerance that {MOST_SEGMENTS} segments along a patch reach; this one needs {most}");
+            let accepted =
+                format!("a tolerance that {MOST_SEGMENTS} segments along a patch reach; this one needs {most}");
             return Err(EditError::parameter("tessellate", "tolerance", tolerance, accepted));
         }
         let quads: f64 = segments.iter().map(|[a, b]| (a + 1.0) * (b + 1.0)).sum();
@@ -181,8 +182,7 @@ impl Patch {
     }
 
     fn at(&self, u: f64, v: f64) -> DVec3 {
-        let column: Vec<DVec4> =
-            self.points.chunks_exact(self.columns).map(|row| casteljau(row.to_vec(), v)).collect();
+        let column: Vec<DVec4> = self.points.chunks_exact(self.columns).map(|row| casteljau(row.to_vec(), v)).collect();
         projected(casteljau(column, u))
     }
 
@@ -209,9 +209,13 @@ impl Patch {
         let p = |i, j| self.point(i, j);
         let most = |values: &mut dyn Iterator<Item = DVec4>| values.map(size).fold(0.0, f64::max);
         let all = |rows: usize, columns: usize| (0..rows).flat_map(move |i| (0..columns).map(move |j| (i, j)));
-        let along_u = most(&mut all(rows.saturating_sub(2), columns).map(|(i, j)| p(i + 2, j) - p(i + 1, j) * 2.0 + p(i, j)));
-        let along_v = most(&mut all(rows, columns.saturating_sub(2)).map(|(i, j)| p(i, j + 2) - p(i, j + 1) * 2.0 + p(i, j)));
-        let mixed = most(&mut all(rows - 1, columns - 1).map(|(i, j)| (p(i + 1, j + 1) - p(i + 1, j)) - (p(i, j + 1) - p(i, j))));
+        let along_u =
+            most(&mut all(rows.saturating_sub(2), columns).map(|(i, j)| p(i + 2, j) - p(i + 1, j) * 2.0 + p(i, j)));
+        let along_v =
+            most(&mut all(rows, columns.saturating_sub(2)).map(|(i, j)| p(i, j + 2) - p(i, j + 1) * 2.0 + p(i, j)));
+        let mixed = most(
+            &mut all(rows - 1, columns - 1).map(|(i, j)| (p(i + 1, j + 1) - p(i + 1, j)) - (p(i, j + 1) - p(i, j))),
+        );
         let (m, n) = ((rows - 1) as f64, (columns - 1) as f64);
         let (m1, m2, m3) = (m * (m - 1.0) * along_u, m * n * mixed, n * (n - 1.0) * along_v);
         // A third of the tolerance for each of the three terms.
@@ -243,9 +247,8 @@ impl Patch {
             let edge = self.edge(side);
             let points = edge_points(&edge, count(&edge));
             let start = mesh.positions.len() as u32;
-            let outer: Vec<(f64, u32)> = (0..points.len())
-                .map(|k| (k as f64 / (points.len() - 1) as f64, start + k as u32))
-                .collect();
+            let outer: Vec<(f64, u32)> =
+                (0..points.len()).map(|k| (k as f64 / (points.len() - 1) as f64, start + k as u32)).collect();
             mesh.positions.extend(points);
             let along = |n: usize, at: &dyn Fn(usize) -> u32| -> Vec<(f64, u32)> {
                 (1..n).map(|k| (k as f64 / n as f64, at(k))).collect()

@@ -154,7 +154,10 @@ impl Reader {
             let rising = knots.is_sorted() && range[axis][0] < range[axis][1];
             let name = ["u", "v"][axis];
             if counts[axis] <= degree || !rising {
-                return Err(format!("`parm {name}`: more than {} rising values, as many as points and degree ask for", 2 * degree + 1));
+                return Err(format!(
+                    "`parm {name}`: more than {} rising values, as many as points and degree ask for",
+                    2 * degree + 1
+                ));
             }
             let [from, to] = range[axis];
             if from < knots[degree] || to > knots[counts[axis]] {
@@ -162,14 +165,18 @@ impl Reader {
             }
         }
         if counts[0] * counts[1] != points.len() {
-            return Err(format!("{} control points, where the knots ask for {} x {}", points.len(), counts[0], counts[1]));
+            return Err(format!(
+                "{} control points, where the knots ask for {} x {}",
+                points.len(),
+                counts[0],
+                counts[1]
+            ));
         }
         // Rows of constant v in the file; first all of them along u, then what comes out along v.
         let rows: Vec<Vec<DVec4>> = points.chunks_exact(counts[0]).map(<[DVec4]>::to_vec).collect();
         let strips = pieces(rows, &parameters[0], degrees[0], range[0]);
         for strip in strips {
-            let across: Vec<Vec<DVec4>> =
-                (0..=degrees[0]).map(|i| strip.iter().map(|row| row[i]).collect()).collect();
+            let across: Vec<Vec<DVec4>> = (0..=degrees[0]).map(|i| strip.iter().map(|row| row[i]).collect()).collect();
             for piece in pieces(across, &parameters[1], degrees[1], range[1]) {
                 self.patches.push(Patch { columns: degrees[1] + 1, points: piece.concat() });
             }

@@ -191,7 +191,9 @@ impl<'a> Merge<'a> {
     }
 
     fn overlaps(&self, origin: IVec3) -> bool {
-        self.around.as_ref().is_none_or(|b| (origin + 7).as_dvec3().cmpge(b.lo).all() && origin.as_dvec3().cmple(b.hi).all())
+        self.around
+            .as_ref()
+            .is_none_or(|b| (origin + 7).as_dvec3().cmpge(b.lo).all() && origin.as_dvec3().cmple(b.hi).all())
     }
 
     /// Whether a leaf of the old grid has anything to take from the new one.
@@ -202,7 +204,8 @@ impl<'a> Merge<'a> {
         let (old, there) = (self.old.grid(), self.new.find(self.old.grid().origin(id)));
         let appear = self.new.mask(there).zip(old.mask(id), |new, old| new & !old);
         let (before, after) = (&old.values(id).0, &self.new.values(there).0);
-        !appear.is_empty() || (0..LEAF_VOXELS).any(|at| !old.mask(id).get(at) && (before[at] < 0.0) != (after[at] < 0.0))
+        !appear.is_empty()
+            || (0..LEAF_VOXELS).any(|at| !old.mask(id).get(at) && (before[at] < 0.0) != (after[at] < 0.0))
     }
 
     /// Cuts the field beside kept voxels to what they allow.

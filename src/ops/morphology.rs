@@ -346,7 +346,9 @@ mod tests {
     fn a_steep_region_on_a_large_offset_is_a_valid_surface() {
         let ball = level_set(30, |p| (p - DVec3::new(0.3, 0.1, -0.2)).length() - 20.0);
         for (name, distance) in [("dilate", "12vx"), ("erode", "9vx"), ("open", "6vx"), ("close", "12vx")] {
-            for region in ["box center=10,0,0 size=10,8,8 soft=1,1", "box center=10,0,0 size=10,8,8", "halfspace normal=1,1,0"] {
+            for region in
+                ["box center=10,0,0 size=10,8,8 soft=1,1", "box center=10,0,0 size=10,8,8", "halfspace normal=1,1,0"]
+            {
                 let outcome = in_region(&ball, name, distance, region);
                 assert_kept(&ball, &outcome.level_set, region);
                 let found = outcome.level_set.check();
@@ -385,7 +387,8 @@ mod tests {
         let balls = |p: DVec3| [(p - DVec3::X * 7.0).length() - 12.0, (p + DVec3::X * 7.0).length() - 14.0];
         let distance = "3vx".parse().unwrap();
         for open in [true, false] {
-            let body = level_set(30, |p| if open { balls(p)[0].max(balls(p)[1]) } else { balls(p)[0].min(balls(p)[1]) });
+            let body =
+                level_set(30, |p| if open { balls(p)[0].max(balls(p)[1]) } else { balls(p)[0].min(balls(p)[1]) });
             // Neither is a distance everywhere.
             let body = rebuild(&body, &Rebuild::band(3.0), &run).unwrap();
             let apply = |input: &LevelSet| match open {
@@ -416,7 +419,8 @@ mod tests {
         /// Active voxels with their values.
         fn band_voxels(&self) -> Vec<(IVec3, f32)> {
             let grid = self.grid();
-            let voxels = |id| grid.mask(id).iter().map(move |at| (grid.origin(id) + offset_to_local(at), grid.values(id).0[at]));
+            let voxels =
+                |id| grid.mask(id).iter().map(move |at| (grid.origin(id) + offset_to_local(at), grid.values(id).0[at]));
             grid.leaves().iter().copied().flat_map(voxels).collect()
         }
     }
@@ -425,7 +429,10 @@ mod tests {
     fn negative_distances_are_for_offset_only() {
         let distance = WorldLength::new(-1.0);
         assert!(Offset { distance, ..Offset::default() }.validate().is_ok());
-        assert!(Dilate { distance, ..Dilate::default() }.validate().is_err() && Open { distance, ..Open::default() }.validate().is_err());
+        assert!(
+            Dilate { distance, ..Dilate::default() }.validate().is_err()
+                && Open { distance, ..Open::default() }.validate().is_err()
+        );
         assert!(Offset { distance: WorldLength::new(f64::NAN), ..Offset::default() }.validate().is_err());
     }
 }

@@ -86,7 +86,11 @@ impl Operator for Segment {
             Err(EditError::parameter(Self::NAME, field, value, accepted.to_owned()))
         };
         let Some(iso) = self.iso.filter(|v| v.is_finite()) else {
-            return refuse("iso", self.iso.unwrap_or(f64::NAN).to_string(), "the value at the surface: a finite number");
+            return refuse(
+                "iso",
+                self.iso.unwrap_or(f64::NAN).to_string(),
+                "the value at the surface: a finite number",
+            );
         };
         if let Some(upper) = self.upper {
             if !(upper > iso && upper.is_finite()) {
@@ -176,8 +180,7 @@ pub fn segment(scan: &Scan, params: &Segment, run: &RunOptions) -> Result<Outcom
 
 /// A solid on the lattice of a scan.
 fn seeded(scan: &Scan, seed: &str, run: &RunOptions) -> Result<LevelSet> {
-    let transform =
-        scan.transform().map_err(|problem| EditError::parameter(Segment::NAME, "volume", "", problem))?;
+    let transform = scan.transform().map_err(|problem| EditError::parameter(Segment::NAME, "volume", "", problem))?;
     let solid = Expression::parse(seed)?;
     let size = transform.voxel_size();
     let refuse = || EditError::parameter(Segment::NAME, "seed", seed, "a solid that overlaps the volume");
@@ -196,7 +199,8 @@ fn seeded(scan: &Scan, seed: &str, run: &RunOptions) -> Result<LevelSet> {
     let rim = f64::from(ROUGH_BAND) + 2.0;
     let (lo, hi) = (lo.max(DVec3::splat(-rim)) - rim, hi.min(top + rim) + rim);
     let value = |ijk: DVec3| solid.value(transform.index_to_world(ijk)) / size;
-    let rough = LevelSet::from_distance(transform, ROUGH_BAND, (lo.floor().as_ivec3(), hi.ceil().as_ivec3()), value, run)?;
+    let rough =
+        LevelSet::from_distance(transform, ROUGH_BAND, (lo.floor().as_ivec3(), hi.ceil().as_ivec3()), value, run)?;
     rebuild(&rough, &Rebuild::band(DEFAULT_HALF_WIDTH), run)
 }
 
@@ -263,7 +267,8 @@ mod tests {
         assert!((volume(&below).volume / ball(12.0) - 1.0).abs() < 0.01);
         let nothing = Segment { iso: Some(1e6), ..Segment::default() };
         assert_eq!(segment(&scan, &nothing, &run).err().unwrap().exit_code(), 3);
-        let aside = Segment { iso: Some(100.0), seed: Some("sphere center=900,0,0 radius=1".into()), ..Segment::default() };
+        let aside =
+            Segment { iso: Some(100.0), seed: Some("sphere center=900,0,0 radius=1".into()), ..Segment::default() };
         assert_eq!(segment(&scan, &aside, &run).err().unwrap().exit_code(), 2);
     }
 

@@ -60,7 +60,9 @@ impl Source {
             return Expression::parse(text).map(Self::Solid);
         }
         let spec = Spec::parse("shape", text)?;
-        let file = spec.text("file").ok_or_else(|| spec.refuse("`bezier` needs `file=` (a BPT file of patches, or an OBJ file of free-form surfaces)"))?;
+        let file = spec.text("file").ok_or_else(|| {
+            spec.refuse("`bezier` needs `file=` (a BPT file of patches, or an OBJ file of free-form surfaces)")
+        })?;
         let thickness = spec.number("thickness")?;
         spec.finish()?;
         if thickness.is_some_and(|t| t <= 0.0) {

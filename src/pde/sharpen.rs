@@ -140,7 +140,9 @@ impl LeafKernel for Sharpen<'_> {
             #[inline(always)]
             |x, y, _| {
                 let at = x * 64 + y * 8;
-                let k = if experiment().0 == 1 { binomial_mean(simd, curvature, x, y) } else {
+                let k = if experiment().0 == 1 {
+                    binomial_mean(simd, curvature, x, y)
+                } else {
                     let v = curvature.rows(simd, x, y, [0, 0, 0]);
                     v.simd_lt(f32::MAX).select(v, Lanes::splat(simd, 0.0))
                 };
@@ -163,7 +165,8 @@ fn binomial_mean<S: Simd>(simd: S, halo: &Halo, x: usize, y: usize) -> Lanes<S> 
     for dx in -1..=1isize {
         for dy in -1..=1isize {
             for dz in -1..=1isize {
-                let weight = Lanes::splat(simd, f32::from(8u8 >> (dx.unsigned_abs() + dy.unsigned_abs() + dz.unsigned_abs())));
+                let weight =
+                    Lanes::splat(simd, f32::from(8u8 >> (dx.unsigned_abs() + dy.unsigned_abs() + dz.unsigned_abs())));
                 let value = halo.rows(simd, x, y, [dx, dy, dz]);
                 let known = value.simd_lt(f32::MAX);
                 sum += known.select(value * weight, zero);
@@ -192,13 +195,30 @@ mod tests {
     use crate::pde::{CutOff, FlowCurvature, UpwindScheme};
     use crate::stencil::{Cube, SlabScratch, box_mean};
 
-    struct Unsharp<'a> { flow: &'a CurvatureFlow, start: &'a Grid, reach: f32, dt: f32, width: usize, background: f32 }
+    struct Unsharp<'a> {
+        flow: &'a CurvatureFlow,
+        start: &'a Grid,
+        reach: f32,
+        dt: f32,
+        width: usize,
+        background: f32,
+    }
     impl LeafKernel for Unsharp<'_> {
         const REACH: usize = 1;
         type Scratch = (Cube, SlabScratch, FaceHalo);
-        fn scratch(&self) -> Self::Scratch { (Cube::new(self.width), SlabScratch::new(self.width), FaceHalo::default()) }
+        fn scratch(&self) -> Self::Scratch {
+            (Cube::new(self.width), SlabScratch::new(self.width), FaceHalo::default())
+        }
         #[inline(always)]
-        fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, (cube, scratch, phi): &mut Self::Scratch, out: &mut LeafValues) {
+        fn euler<S: Simd>(
+            &self,
+            simd: S,
+            grid: &Grid,
+            id: LeafId,
+            rows: LeafMask,
+            (cube, scratch, phi): &mut Self::Scratch,
+            out: &mut LeafValues,
+        ) {
             let around = &grid.neighbours()[id.index()];
             cube.gather(grid.value_pages(), around, rows);
             phi.gather(grid.value_pages(), around);
@@ -217,11 +237,26 @@ mod tests {
             });
         }
     }
-    struct UnsharpMotion<'a> { flow: &'a CurvatureFlow, start: &'a Grid, reach: f32, width: usize, background: f32 }
+    struct UnsharpMotion<'a> {
+        flow: &'a CurvatureFlow,
+        start: &'a Grid,
+        reach: f32,
+        width: usize,
+        background: f32,
+    }
     impl Motion for UnsharpMotion<'_> {
-        fn prepare(&mut self, _: &Tracker, _: f64) -> Option<f64> { Some(1.0 / 6.0) }
+        fn prepare(&mut self, _: &Tracker, _: f64) -> Option<f64> {
+            Some(1.0 / 6.0)
+        }
         fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
-            let k = Unsharp { flow: self.flow, start: self.start, reach: self.reach, dt: dt as f32, width: self.width, background: self.background };
+            let k = Unsharp {
+                flow: self.flow,
+                start: self.start,
+                reach: self.reach,
+                dt: dt as f32,
+                width: self.width,
+                background: self.background,
+            };
             tracker.integrate(&k, TimeIntegrator::TvdRk1, Target::Moving)
         }
     }
@@ -238,11 +273,15 @@ mod tests {
     /// bump amplitude, noise rms (least squares on [1, bumps, bumps²]), radius range
     fn analyse(l: &LevelSet) -> (f64, f64, f64, f64) {
         let mut s = l.sampler();
-        let rs: Vec<(f64, f64)> = directions().map(|n| {
-            let mut r = 16.0;
-            for _ in 0..20 { r -= f64::from(s.trilinear(n * r)); }
-            (r, bumps(n))
-        }).collect();
+        let rs: Vec<(f64, f64)> = directions()
+            .map(|n| {
+                let mut r = 16.0;
+                for _ in 0..20 {
+                    r -= f64::from(s.trilinear(n * r));
+                }
+                (r, bumps(n))
+            })
+            .collect();
         let n = rs.len() as f64;
         let (mr, mb) = (rs.iter().map(|v| v.0).sum::<f64>() / n, rs.iter().map(|v| v.1).sum::<f64>() / n);
         let sbb: f64 = rs.iter().map(|v| (v.1 - mb).powi(2)).sum();
@@ -257,7 +296,9 @@ mod tests {
         let noise = |p: DVec3, amp: f64| {
             let q = p.floor().as_ivec3();
             let mut h = (q.x as u64) << 40 ^ (q.y as u64 & 0xfffff) << 20 ^ (q.z as u64 & 0xfffff);
-            for f in [0xbf58_476d_1ce4_e5b9u64, 0x94d0_49bb_1331_11eb] { h = (h ^ h >> 30).wrapping_add(0x9e37_79b9_7f4a_7c15).wrapping_mul(f); }
+            for f in [0xbf58_476d_1ce4_e5b9u64, 0x94d0_49bb_1331_11eb] {
+                h = (h ^ h >> 30).wrapping_add(0x9e37_79b9_7f4a_7c15).wrapping_mul(f);
+            }
             ((h >> 40) as f64 / 8388608.0 - 1.0) * amp
         };
         let run = RunOptions::default();
@@ -266,28 +307,45 @@ mod tests {
             let mut l = sampled(24, move |p| p.length() - 16.0 - 0.5 * bumps(p.normalize_or_zero()) + noise(p, amp));
             crate::pde::track(&mut l, &solver, &run).unwrap();
             println!("noise {amp}: start {:?}", analyse(&l));
-            for (name, cut) in [("high .15 .25", CutOff::NONE.with_high([0.15, 0.25]).unwrap()), ("low .01 .013 high .8 .9", CutOff::NONE.with_low([0.01, 0.013]).unwrap().with_high([0.8, 0.9]).unwrap())] {
+            for (name, cut) in [
+                ("high .15 .25", CutOff::NONE.with_high([0.15, 0.25]).unwrap()),
+                (
+                    "low .01 .013 high .8 .9",
+                    CutOff::NONE.with_low([0.01, 0.013]).unwrap().with_high([0.8, 0.9]).unwrap(),
+                ),
+            ] {
                 let flow = CurvatureFlow { cut_off: cut, curvature: FlowCurvature::Mean, ..CurvatureFlow::MEAN };
                 for (variant, what) in [(0, "raw"), (1, "binomial"), (11, "unsharp 1"), (12, "unsharp 2")] {
                     for reach in [1.0, 10.0] {
-                    print!("{name} {what} reach {reach}:");
-                    let mut m = l.clone();
-                    for _ in 0..4 {
-                        if variant < 10 {
-                            EXPERIMENT.store(variant, std::sync::atomic::Ordering::Relaxed);
-                            let start = l.clone();
-                            let mut t = Tracker::new(&mut m, None, solver, &run);
-                            let mut mo = Sharpening { flow: &flow, start: start.grid(), reach: reach as f32, curvature: Paged::default() };
-                            drive(&mut t, &mut mo, Until::Iterations(10)).unwrap();
-                        } else {
-                            let mut t = Tracker::new(&mut m, None, solver, &run);
-                            let mut mo = UnsharpMotion { flow: &flow, start: l.grid(), reach: reach as f32, width: (variant - 10) as usize, background: 3.0 };
-                            drive(&mut t, &mut mo, Until::Iterations(10)).unwrap();
+                        print!("{name} {what} reach {reach}:");
+                        let mut m = l.clone();
+                        for _ in 0..4 {
+                            if variant < 10 {
+                                EXPERIMENT.store(variant, std::sync::atomic::Ordering::Relaxed);
+                                let start = l.clone();
+                                let mut t = Tracker::new(&mut m, None, solver, &run);
+                                let mut mo = Sharpening {
+                                    flow: &flow,
+                                    start: start.grid(),
+                                    reach: reach as f32,
+                                    curvature: Paged::default(),
+                                };
+                                drive(&mut t, &mut mo, Until::Iterations(10)).unwrap();
+                            } else {
+                                let mut t = Tracker::new(&mut m, None, solver, &run);
+                                let mut mo = UnsharpMotion {
+                                    flow: &flow,
+                                    start: l.grid(),
+                                    reach: reach as f32,
+                                    width: (variant - 10) as usize,
+                                    background: 3.0,
+                                };
+                                drive(&mut t, &mut mo, Until::Iterations(10)).unwrap();
+                            }
+                            let (a, r, lo, hi) = analyse(&m);
+                            print!(" [bump {a:.3} noise {r:.4} {lo:.1}..{hi:.1} {}]", m.measure(&run).unwrap().euler);
                         }
-                        let (a, r, lo, hi) = analyse(&m);
-                        print!(" [bump {a:.3} noise {r:.4} {lo:.1}..{hi:.1} {}]", m.measure(&run).unwrap().euler);
-                    }
-                    println!();
+                        println!();
                     }
                 }
             }

@@ -128,15 +128,7 @@ impl LeafKernel for GrowthStep<'_> {
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(
-        &self,
-        simd: S,
-        grid: &Grid,
-        id: LeafId,
-        rows: LeafMask,
-        halo: &mut Halo,
-        out: &mut LeafValues,
-    ) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, halo: &mut Halo, out: &mut LeafValues) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         let (h, dt) = (self.voxel_size, self.dt);
         let bending = 2.0 * self.smoothness * h * h;

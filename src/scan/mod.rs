@@ -222,8 +222,7 @@ impl Scan {
     /// Its voxels must be cubes. `None` if no sample is inside.
     pub fn iso_field(&self, iso: f32, inside: Inside, run: &RunOptions) -> Result<Option<LevelSet>, EditError> {
         const OPERATION: &str = "the surface of a scan";
-        let transform =
-            self.transform().map_err(|problem| EditError::parameter(OPERATION, "scan", "", problem))?;
+        let transform = self.transform().map_err(|problem| EditError::parameter(OPERATION, "scan", "", problem))?;
         let Some((least, most)) = self.range() else { return Ok(None) };
         let of_range = [inside.field(least, iso), inside.field(most, iso)];
         let background = of_range[0].abs().max(of_range[1].abs());
@@ -291,7 +290,8 @@ mod tests {
     fn ball(spacing: DVec3, turn: DMat3) -> Scan {
         let extent = DVec3::new(16.0, 18.0, 20.0);
         let size = (extent / spacing).to_array().map(|n| n as usize + 1);
-        let to_world = DAffine3::from_mat3_translation(turn * DMat3::from_diagonal(spacing), DVec3::new(5.0, 0.0, -2.0));
+        let to_world =
+            DAffine3::from_mat3_translation(turn * DMat3::from_diagonal(spacing), DVec3::new(5.0, 0.0, -2.0));
         let [nx, ny, nz] = size;
         let values = (0..nx * ny * nz).map(|i| {
             let ijk = DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / nx / ny) as f64);
@@ -321,7 +321,11 @@ mod tests {
                 let volume = 4.0 / 3.0 * std::f64::consts::PI * f64::powi(radius, 3);
                 // Chords cut h²/(8 R) off the radius, h the largest spacing.
                 let tolerance = 3.0 * (spacing.max_element() / radius).powi(2) / 2.0;
-                assert!((measured.volume / volume - 1.0).abs() < tolerance, "{spacing} {iso}: {}", measured.volume / volume);
+                assert!(
+                    (measured.volume / volume - 1.0).abs() < tolerance,
+                    "{spacing} {iso}: {}",
+                    measured.volume / volume
+                );
                 assert_eq!((measured.components, measured.euler), (1, 2));
                 let centre = DVec3::new(5.0, 0.0, -2.0) + turn * DVec3::new(8.0, 9.0, 10.0);
                 let (lo, hi) = level_set.world_bounds().unwrap();
@@ -350,7 +354,9 @@ mod tests {
 
     #[test]
     fn endings() {
-        for (name, is) in [("a.nrrd", true), ("b.NII.GZ", true), ("c.nii", true), ("d.nhdr", true), ("e.gz", false), ("f.vdb", false)] {
+        for (name, is) in
+            [("a.nrrd", true), ("b.NII.GZ", true), ("c.nii", true), ("d.nhdr", true), ("e.gz", false), ("f.vdb", false)]
+        {
             assert_eq!(is_scan(Path::new(name)), is, "{name}");
         }
     }

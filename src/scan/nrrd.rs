@@ -109,12 +109,18 @@ impl Header {
 
     /// Samples along each axis of the file.
     fn sizes(&self) -> Result<Vec<usize>, String> {
-        let dimension: usize =
-            self.required("dimension")?.parse().ok().filter(|d| (1..=16).contains(d)).ok_or("its `dimension` is none")?;
+        let dimension: usize = self
+            .required("dimension")?
+            .parse()
+            .ok()
+            .filter(|d| (1..=16).contains(d))
+            .ok_or("its `dimension` is none")?;
         let text = self.required("sizes")?;
         let sizes: Option<Vec<usize>> =
             text.split_whitespace().map(|n| n.parse().ok().filter(|n: &usize| *n > 0)).collect();
-        sizes.filter(|s| s.len() == dimension).ok_or_else(|| format!("its `sizes` are `{text}`, not {dimension} numbers"))
+        sizes
+            .filter(|s| s.len() == dimension)
+            .ok_or_else(|| format!("its `sizes` are `{text}`, not {dimension} numbers"))
     }
 
     /// The axes of space: all but those of one sample, where there are more than three.
@@ -126,9 +132,9 @@ impl Header {
         }
         while axes.len() > 3 {
             let flat = axes.iter().position(|axis| sizes[*axis] == 1);
-            axes.remove(flat.ok_or_else(|| {
-                format!("has {sizes:?} samples; one number a voxel on three axes is read")
-            })?);
+            axes.remove(
+                flat.ok_or_else(|| format!("has {sizes:?} samples; one number a voxel on three axes is read"))?,
+            );
         }
         axes.try_into().map_err(|_| format!("has {sizes:?} samples; three axes are wanted"))
     }
@@ -143,7 +149,12 @@ impl Header {
             "ushort" | "unsigned short" | "unsigned short int" | "uint16" | "uint16_t" => Kind::U16,
             "int" | "signed int" | "int32" | "int32_t" => Kind::I32,
             "uint" | "unsigned int" | "uint32" | "uint32_t" => Kind::U32,
-            "longlong" | "long long" | "long long int" | "signed long long" | "signed long long int" | "int64"
+            "longlong"
+            | "long long"
+            | "long long int"
+            | "signed long long"
+            | "signed long long int"
+            | "int64"
             | "int64_t" => Kind::I64,
             "ulonglong" | "unsigned long long" | "unsigned long long int" | "uint64" | "uint64_t" => Kind::U64,
             "float" => Kind::F32,
@@ -266,7 +277,10 @@ mod tests {
         for bytes in [
             file("encoding: gzip\nendian: big\n", &gzip.finish().unwrap()),
             file("encoding: ascii\n", text.as_bytes()),
-            file("encoding: raw\nendian: little\nline skip: 1\nbyte skip: 3\n", &[b"one\nabc", &numbers(false)[..]].concat()),
+            file(
+                "encoding: raw\nendian: little\nline skip: 1\nbyte skip: 3\n",
+                &[b"one\nabc", &numbers(false)[..]].concat(),
+            ),
             file("encoding: raw\nendian: big\nbyte skip: -1\n", &[b"anything", &numbers(true)[..]].concat()),
         ] {
             assert_eq!(read_bytes(&bytes).unwrap(), raw);
@@ -292,7 +306,8 @@ mod tests {
         let p = DVec3::new(1.0, 2.0, 3.0);
         assert_eq!(at("").to_world().transform_point3(p), p);
         assert_eq!(at("spacings: 2 -3 NaN\n").to_world().transform_point3(p), DVec3::new(2.0, 6.0, 3.0));
-        let placed = at("space: left-posterior-superior\nspace directions: (0,2,0) (-2,0,0) (0, 0, 2)\nspace origin: (1,1,5)\n");
+        let placed =
+            at("space: left-posterior-superior\nspace directions: (0,2,0) (-2,0,0) (0, 0, 2)\nspace origin: (1,1,5)\n");
         assert_eq!(placed.to_world().transform_point3(p), DVec3::new(-3.0, 3.0, 11.0));
         assert_eq!(placed.transform().unwrap().voxel_size(), 2.0);
         let four = String::from_utf8(file("", b"")).unwrap();

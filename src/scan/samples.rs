@@ -138,8 +138,10 @@ impl Samples {
         let mut text = String::new();
         input.read_to_string(&mut text).map_err(|e| format!("cannot be read: {e}"))?;
         let words = text.split(|c: char| c.is_whitespace() || c == ',').filter(|w| !w.is_empty());
-        let values: Vec<f32> =
-            words.take(count).map(|w| w.parse().map_err(|_| format!("`{w}` is no number"))).collect::<Result<_, _>>()?;
+        let values: Vec<f32> = words
+            .take(count)
+            .map(|w| w.parse().map_err(|_| format!("`{w}` is no number")))
+            .collect::<Result<_, _>>()?;
         match values.len() == count {
             true => Ok(values),
             false => Err(format!("is truncated: {} of {count} samples are there", values.len())),

@@ -264,7 +264,10 @@ mod tests {
     fn the_numbers_of_torus_ellipsoid_saddle_and_crease() {
         let near = |got: [f64; 4], expected: [f64; 4], tolerance: f64| {
             for k in 0..4 {
-                assert!((got[k] - expected[k]).abs() < tolerance * expected[2].abs().max(expected[3].abs()).max(1.0), "{k}: {got:?} {expected:?}");
+                assert!(
+                    (got[k] - expected[k]).abs() < tolerance * expected[2].abs().max(expected[3].abs()).max(1.0),
+                    "{k}: {got:?} {expected:?}"
+                );
             }
         };
         let torus = |p: DVec3| (p.x.hypot(p.y) - 0.9).hypot(p.z) - 0.4;
@@ -274,7 +277,11 @@ mod tests {
         near(at_point(h, DVec3::X * 0.5, &torus), [0.25, -5.0, 2.5, -2.0], 0.003);
         // An ellipsoid at the end of its first axis, a/b² and a/c²; its quadratic is no distance, with a slope of 2 there.
         let axes = DVec3::new(1.0, 0.7, 0.5);
-        near(at_point(h, DVec3::X, &|p| ((p / axes).length_squared() - 1.0) / 2.0), [3.0204, 8.163, 4.0, 2.0408], 0.003);
+        near(
+            at_point(h, DVec3::X, &|p| ((p / axes).length_squared() - 1.0) / 2.0),
+            [3.0204, 8.163, 4.0, 2.0408],
+            0.003,
+        );
         for radius in [0.5, 1.0, 2.0] {
             let saddle = at_point(h, DVec3::ZERO, &|p| p.z - (p.x * p.x - p.y * p.y) / (2.0 * radius));
             near(saddle, [0.0, -1.0 / (radius * radius), 1.0 / radius, -1.0 / radius], 0.003);
