@@ -19,6 +19,7 @@ pub mod segment;
 mod sequence;
 pub mod shape;
 pub mod smooth;
+pub mod smooth_csg;
 mod solver;
 pub mod sweep;
 pub mod transform;
