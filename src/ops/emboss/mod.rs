@@ -130,6 +130,9 @@ const SOLVER: SolverOptions =
 /// How far a stamp stands out where nothing is asked for, in voxels.
 const DEFAULT_HEIGHT: f64 = 3.0;
 
+/// Most steps of attraction where nothing is asked for.
+const MOST_STEPS: u32 = 1000;
+
 /// Flattening of curves, in voxels.
 const FLATNESS: f64 = 0.02;
 
@@ -417,7 +420,7 @@ impl Operator for Emboss {
         let mut outcome = evolved(level_set, run, |level_set| {
             let how = self.attraction(level_set)?;
             let (region, until, solver) =
-                (region.as_deref(), self.evolution.until_rest(), self.evolution.solver(SOLVER));
+                (region.as_deref(), self.evolution.until_rest(MOST_STEPS), self.evolution.solver(SOLVER));
             let report = match source {
                 Source::Solid(_) => attract(level_set, &Solid::new(&tree), &how, region, until, &solver, run)?,
                 _ => attract(level_set, &Surface(&tree), &how, region, until, &solver, run)?,
