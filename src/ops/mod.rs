@@ -5,6 +5,7 @@
 //! in [`REGISTRY`] and knows nothing of any one of them.
 
 pub mod advect;
+pub mod blend;
 pub mod compare;
 mod confine;
 pub mod csg;
@@ -12,12 +13,14 @@ mod curvature;
 pub mod distance;
 pub mod emboss;
 mod keep;
+pub mod fillet;
 pub mod morphology;
 mod params;
 mod registry;
 pub mod segment;
 mod sequence;
 pub mod shape;
+pub mod sharpen;
 pub mod smooth;
 mod solver;
 pub mod sweep;

@@ -24,12 +24,10 @@ use serde::{Deserialize, Serialize};
 use super::curvature::{CurvatureOptions, unresolved};
 use super::params::words;
 use super::registry::{Arity, Operator, Outcome};
-use super::solver::{EvolutionOptions, evolved};
+use super::solver::{EvolutionOptions, SMOOTHING, evolved};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
-use crate::pde::{
-    CurvatureFlow, Filter, FilterKind, Report, SolverOptions, SpeedFunction, UpwindScheme, evolve, filter,
-};
+use crate::pde::{CurvatureFlow, Filter, FilterKind, Report, SpeedFunction, evolve, filter};
 use crate::run::RunOptions;
 use crate::stencil::FaceHalo;
 use crate::stencil::curvature::laplacian;
@@ -79,9 +77,6 @@ impl Default for Smooth {
         }
     }
 }
-
-/// The cheapest that keeps the sphere of the module's comment within 0.05 voxel.
-const SOLVER: SolverOptions = SolverOptions { scheme: UpwindScheme::HjWeno5, ..SolverOptions::FIRST_ORDER };
 
 impl Operator for Smooth {
     const NAME: &'static str = "smooth";
@@ -138,7 +133,7 @@ impl Smooth {
 pub fn smooth(level_set: &mut LevelSet, params: &Smooth, run: &RunOptions) -> Result<Report> {
     params.validate()?;
     let region = params.evolution.region.on(level_set, run)?;
-    let (region, until, solver) = (region.as_deref(), params.evolution.until(), params.evolution.solver(SOLVER));
+    let (region, until, solver) = (region.as_deref(), params.evolution.until(), params.evolution.solver(SMOOTHING));
     if let Some(what) = params.filter() {
         return filter(level_set, what, params.evolution.iterations.unwrap_or(1), region, &solver, run);
     }
