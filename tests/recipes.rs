@@ -128,11 +128,9 @@ fn bad_recipes_are_refused_with_line_and_remedy() {
         ),
         // circular, forward and unused
         (
-            format!("{BALL}{OUT}")
-                .replace("\"shape\"", "\"smooth\"")
-                .replace("spec = \"sphere radius=1\"", "input = \"ball\""),
+            format!("[[step]]\nop = \"smooth\"\ninput = \"ball\"\nname = \"ball\"\n{OUT}"),
             2,
-            &["circular"],
+            &["r.toml:4: smooth `ball`", "circular"],
         ),
         (format!("{}{BALL}", write("ball")), 2, &["r.toml:4: write", "line 6", "circular"]),
         (BALL.into(), 2, &["r.toml:2: shape `ball`", "nothing uses"]),

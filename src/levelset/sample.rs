@@ -57,6 +57,11 @@ impl<'a> Sampler<'a> {
         Self { accessor: grid.accessor(), voxel_size, background: grid.background() }
     }
 
+    /// Edge of a voxel in world units.
+    pub(super) fn voxel_size(&self) -> f64 {
+        self.voxel_size
+    }
+
     /// Value of a voxel.
     pub fn voxel(&mut self, ijk: IVec3) -> f32 {
         self.accessor.value(ijk)
@@ -108,6 +113,13 @@ impl<'a> Sampler<'a> {
     pub fn smooth_gradient(&mut self, ijk: DVec3) -> DVec3 {
         let mut along = |axis: DVec3| f64::from(self.trilinear(ijk + axis)) - f64::from(self.trilinear(ijk - axis));
         DVec3::new(along(DVec3::X), along(DVec3::Y), along(DVec3::Z)) / (2.0 * self.voxel_size)
+    }
+
+    /// Gradient of a voxel by central differences. Index axes, dimensionless.
+    pub fn voxel_gradient(&mut self, ijk: IVec3) -> DVec3 {
+        let mut along =
+            |axis: IVec3| f64::from(self.accessor.value(ijk + axis)) - f64::from(self.accessor.value(ijk - axis));
+        DVec3::new(along(IVec3::X), along(IVec3::Y), along(IVec3::Z)) / (2.0 * self.voxel_size)
     }
 
     /// The surface point closest to an index-space position within the band, by Newton's iteration

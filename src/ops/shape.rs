@@ -134,7 +134,6 @@ impl Operator for Shape {
         self.validate()?;
         let source = Source::parse(&self.spec)?;
         let size = self.resolved_voxel_size(&source)?;
-        let (lo, hi) = source.bounds()?;
         let solid = match source {
             Source::Solid(solid) => solid,
             Source::Patches { patches, thickness } => return self.of_patches(&patches, thickness, size, run),
@@ -144,8 +143,13 @@ impl Operator for Shape {
 }
 
 /// A solid on a lattice.
-pub(super) fn sampled(solid: &Solid, transform: &Transform, half_width: f32, run: &RunOptions) -> Result<LevelSet> {
-    let (lo, hi) = solid.bounds();
+pub(super) fn sampled(
+    solid: &Expression,
+    transform: &Transform,
+    half_width: f32,
+    run: &RunOptions,
+) -> Result<LevelSet> {
+    let Some((lo, hi)) = solid.bounds() else { return Ok(LevelSet::empty(*transform, half_width)) };
     let corners = (0..8).map(|c| DVec3::select(BVec3::new(c & 4 != 0, c & 2 != 0, c & 1 != 0), hi, lo));
     let corners = corners.map(|corner| transform.world_to_index(corner));
     let (lo, hi) = corners.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), c| (lo.min(c), hi.max(c)));

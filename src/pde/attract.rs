@@ -8,12 +8,16 @@
 //! point y closest to each voxel, since at a voxel on the target u would not be defined, and behind it it would turn round.
 //!
 //! C rises from 0 to 1 between two cosines, so that only what faces the target moves: a target at height d above a plane draws a
-//! disc of radius d·tan(arccos γ). Near the target that disc shrinks to a voxel, and flanks of the bump face away: a single point
-//! would never be reached. So what is within a few voxels of the target (`tip`) is drawn whatever its angle.
+//! disc of radius d·tan(arccos γ). Near the target that disc shrinks to a voxel, and a single point would never be reached. So within
+//! a few voxels of the target (`tip`) everything that does not face away is drawn: the limits fall to 0 and 0.2.
+//!
+//! F depends on the normal: where C rises, a change of the normal travels along the surface towards the target at the speed |φ(p)| C′(γ) |u − (n·u)n|,
+//! many times faster than the surface itself moves. So the normal is taken a voxel upwind of y, and that speed bounds the step as well: with central
+//! differences and longer steps, flanks break up into pits.
 //!
 //! Pushed surfaces move by −F, faster and faster: a largest depth, measured from where the surface was, or a time ends it.
 
-use glam::DVec3;
+use glam::{DVec3, IVec3};
 
 use super::evolve::{Motion, Report, StopReason, Until, drive};
 use super::morph::{FirstOrder, MorphSpeed, MorphStep};
@@ -37,7 +41,7 @@ pub trait Attractor: Sync {
 pub struct Attraction {
     /// C of the cosine γ.
     pub cut_off: CutOff,
-    /// Distance from the target, in voxels, within which angles do not count. 0 for the limits alone.
+    /// Distance from the target, in voxels, within which all that does not face away is drawn. 0 for the limits alone.
     pub tip: f64,
     /// Away from the target instead of towards it.
     pub repel: bool,
@@ -81,6 +85,15 @@ const LONGEST_TIMED: f64 = 0.1;
 
 /// Longest step where only the end matters.
 const LONGEST_STEP: f64 = 0.5;
+
+/// Largest way in a step, in voxels, of what travels along the surface.
+const TRAVEL: f64 = 0.8;
+
+/// Half the interval of cosines over which C′ is measured.
+const SLOPE_STEP: f64 = 0.02;
+
+/// The cosine from which on a surface within the tip is drawn fully.
+const SIDEWAYS: f64 = 0.2;
 
 /// Voxels with less of the pull do not tell whether all that draws is reached: the rim of a region would never be.
 const DRAWN: f32 = 0.5;
@@ -171,6 +184,8 @@ impl Region for Within<'_> {
 struct Felt {
     /// F, world units a unit of time.
     speed: f32,
+    /// |φ(p)| C′(γ) |u − (n·u)n|: how fast a change of the normal travels along the surface.
+    transport: f32,
     /// C.
     share: f32,
     /// |φ(p)| in voxels, or how far a pushed surface still goes.
@@ -190,16 +205,25 @@ struct Pull<'a> {
 
 impl Pull<'_> {
     /// What the voxel at `ijk` feels; `None` where the field has no normal, or without a target.
-    fn at(&self, sampler: &mut Sampler, voxel_size: f64, ijk: DVec3) -> Option<Felt> {
-        let (foot, normal) = foot(sampler, voxel_size, ijk)?;
+    fn at(&self, sampler: &mut Sampler, voxel_size: f64, ijk: IVec3) -> Option<Felt> {
+        let (foot, mut normal) = foot(sampler, voxel_size, ijk)?;
         let point = self.target.closest(foot)?;
         let (to, phi) = (point - foot, f64::from(sampler.trilinear(point)));
         let distance = to.length();
+        let aside = to - normal * normal.dot(to);
+        if aside.length() > 1e-6 {
+            // Against the wind: what happens at the rim of C travels to the target, or from it.
+            let upwind = aside * (aside.length().min(1.0) / aside.length());
+            let from = if self.how.repel { foot + upwind } else { foot - upwind };
+            normal = sampler.smooth_gradient(from).try_normalize()?;
+        }
         let cosine = if distance > 1e-6 { normal.dot(to) / distance * phi.signum() } else { 1.0 };
-        let facing = self.how.cut_off.weight(cosine);
         let near =
-            if self.how.tip > 0.0 { 1.0 - ramp_between(distance, self.how.tip / 2.0, self.how.tip) } else { 0.0 };
-        let mut share = facing.max(near);
+            if distance < self.how.tip { 1.0 - ramp_between(distance, self.how.tip / 2.0, self.how.tip) } else { 0.0 };
+        let share_at = |cosine: f64| self.how.cut_off.weight(cosine).max(near * ramp_between(cosine, 0.0, SIDEWAYS));
+        let mut share = share_at(cosine);
+        let slope = (share_at(cosine + SLOPE_STEP) - share_at(cosine - SLOPE_STEP)).abs() / (2.0 * SLOPE_STEP);
+        let transport = slope * phi.abs() * (1.0 - cosine * cosine).max(0.0).sqrt();
         let mut gap = phi.abs() / voxel_size;
         let mut speed = phi;
         if self.how.repel {
@@ -216,14 +240,15 @@ impl Pull<'_> {
                 share = 0.0;
             }
         }
-        Some(Felt { speed: (share * speed) as f32, share: share as f32, gap, distance, point })
+        let (speed, transport) = ((share * speed) as f32, transport as f32);
+        Some(Felt { speed, transport, share: share as f32, gap, distance, point })
     }
 }
 
 /// The surface point closest to a voxel, and the outward normal there.
-fn foot(sampler: &mut Sampler, voxel_size: f64, ijk: DVec3) -> Option<(DVec3, DVec3)> {
-    let phi = f64::from(sampler.trilinear(ijk)) / voxel_size;
-    let mut foot = ijk - sampler.smooth_gradient(ijk).try_normalize()? * phi;
+fn foot(sampler: &mut Sampler, voxel_size: f64, ijk: IVec3) -> Option<(DVec3, DVec3)> {
+    let phi = f64::from(sampler.voxel(ijk)) / voxel_size;
+    let mut foot = ijk.as_dvec3() - sampler.voxel_gradient(ijk).try_normalize()? * phi;
     // There the stencil lies within the band: once more for what the first step missed.
     let gradient = sampler.smooth_gradient(foot);
     let squared = gradient.length_squared();
@@ -266,7 +291,7 @@ fn drawn_bounds(
             if region.is_some_and(|r| r.weight(transform.voxel_to_world(ijk)) <= 0.0) {
                 continue;
             }
-            let Some(felt) = pull.at(&mut sampler, voxel_size, ijk.as_dvec3()) else { continue };
+            let Some(felt) = pull.at(&mut sampler, voxel_size, ijk) else { continue };
             if felt.share > 0.0 && (how.repel || felt.gap >= REACHED) {
                 let (a, b) = (ijk.as_dvec3().min(felt.point), ijk.as_dvec3().max(felt.point));
                 bounds = Some(bounds.map_or((a, b), |(lo, hi)| (lo.min(a), hi.max(b))));
@@ -293,7 +318,7 @@ struct Drawing<'a> {
     /// The leaves that are looked at; all of them at first.
     awake: Option<LeafSet>,
     /// Origins of the leaves that were drawn in the last step.
-    drawn: Vec<glam::IVec3>,
+    drawn: Vec<IVec3>,
     gap: f64,
     /// Mean distance from the targets at the last progress, and the steps left to make some.
     mean: f64,
@@ -304,6 +329,7 @@ struct Drawing<'a> {
 #[derive(Default)]
 struct PageFelt {
     fastest: f32,
+    transport: f32,
     gap: f64,
     /// Sum over the voxels that are drawn, and their number.
     distance: f64,
@@ -327,7 +353,7 @@ impl Drawing<'_> {
             let alpha = tracker.domain.weights().map(|weights| weights.alpha(id));
             let mut drawn = false;
             for offset in tracker.domain.moving(id, grid.mask(id)).iter() {
-                let ijk = (origin + offset_to_local(offset)).as_dvec3();
+                let ijk = origin + offset_to_local(offset);
                 let Some(felt) = self.pull.at(&mut sampler, voxel_size, ijk) else { continue };
                 if felt.speed == 0.0 {
                     continue;
@@ -335,6 +361,7 @@ impl Drawing<'_> {
                 speed.0[offset] = felt.speed;
                 drawn = true;
                 all.fastest = all.fastest.max(felt.speed.abs());
+                all.transport = all.transport.max(felt.transport);
                 if felt.share * alpha.map_or(1.0, |alpha| alpha.0[offset]) >= DRAWN {
                     all.gap = all.gap.max(felt.gap);
                     all.distance += felt.distance;
@@ -353,7 +380,7 @@ impl Drawing<'_> {
         let mut awake = LeafSet::default();
         for &origin in &self.drawn {
             for n in 0..27 {
-                let step = glam::IVec3::new(n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1) * LEAF_DIM;
+                let step = IVec3::new(n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1) * LEAF_DIM;
                 let id = grid.find(origin + step);
                 if !id.is_sentinel() {
                     awake.insert(id);
@@ -394,7 +421,9 @@ impl Motion for Drawing<'_> {
                 return None;
             }
         }
-        let largest = COURANT * f64::from(tracker.voxel_size()) / f64::from(fastest);
+        let transport = felt.iter().map(|f| f.transport).fold(0.0, f32::max);
+        let voxel_size = f64::from(tracker.voxel_size());
+        let largest = (COURANT * voxel_size / f64::from(fastest)).min(TRAVEL * voxel_size / f64::from(transport));
         Some(largest.min(if left.is_finite() { LONGEST_TIMED } else { LONGEST_STEP }).min(left))
     }
 
@@ -407,8 +436,6 @@ impl Motion for Drawing<'_> {
 
 #[cfg(test)]
 mod tests {
-    use glam::IVec3;
-
     use super::*;
     use crate::grid::Transform;
     use crate::levelset::testing::box_distance;
@@ -467,37 +494,92 @@ mod tests {
 
     #[test]
     fn a_sheet_of_points_draws_a_plateau() {
+        // A dense reference in f64: 2.566, 3.816, 3.992; linear theory 4(1 − e^(−t)): 2.528, 3.801, 3.990. Steps of a tenth of the time
+        // are up to 0.05 ahead of it.
         for (t, expected) in [(1.0, 2.566), (3.0, 3.816), (6.0, 3.992)] {
-            let (level_set, _) = drawn(&sheet(4.0), &paper(), Until::Time(t));
-            eprintln!("{t}: {expected} {:?}", [0.0, 5.0, 6.0, 7.0, 9.0].map(|x| height(&level_set, x, 0.0)));
+            let (level_set, report) = drawn(&sheet(4.0), &paper(), Until::Time(t));
+            let z = height(&level_set, 0.0, 0.0);
+            assert!((z - expected).abs() < 0.06 && report.flow.time <= t, "{t} {z}");
+            if t == 6.0 {
+                // The last points are at 6: there the reference has 3 and 1 beside it, one voxel less is within its own cells.
+                let [at6, at7, at9] = [6.0, 7.0, 9.0].map(|x| height(&level_set, x, 0.0));
+                assert!(
+                    (2.0..3.5).contains(&at6) && (0.5..2.0).contains(&at7) && at9.abs() < 0.05,
+                    "{at6} {at7} {at9}"
+                );
+            }
         }
+        // Engraved: −3.816.
         let (level_set, _) = drawn(&sheet(-4.0), &paper(), Until::Time(3.0));
-        eprintln!("engraved {}", height(&level_set, 0.0, 0.0));
+        let z = height(&level_set, 0.0, 0.0);
+        assert!((z + 3.816).abs() < 0.06, "{z}");
+    }
+
+    #[test]
+    fn a_sheet_of_points_pushes_faster_and_faster() {
+        // z = 4(1 − e^t) is −1.967 at t = 0.4; the reference has −1.91.
         let repel = Attraction { repel: true, ..paper() };
         let (level_set, _) = drawn(&sheet(4.0), &repel, Until::Time(0.4));
-        eprintln!("repelled {}", height(&level_set, 0.0, 0.0));
+        let z = height(&level_set, 0.0, 0.0);
+        assert!((z + 1.91).abs() < 0.1, "{z}");
     }
 
     #[test]
-    fn footprint() {
-        let level_set = ground();
-        let target = points([DVec3::new(0.0, 0.0, 6.0)]);
-        let how = paper();
+    fn a_point_draws_what_faces_it() {
+        // Six above a plane: full speed up to .4843·6 = 2.9, none from .75·6 = 4.5 on.
+        let (level_set, target, how) = (ground(), points([DVec3::new(0.0, 0.0, 6.0)]), paper());
         let pull = Pull { target: &target, how: &how, original: None };
         let mut sampler = level_set.sampler();
-        for r in 0..6 {
-            let felt = pull.at(&mut sampler, 1.0, DVec3::new(f64::from(r), 0.0, 1.0)).unwrap();
-            eprintln!("{r} {}", felt.speed);
+        for (r, expected) in (0..6).zip([6.0, 6.0, 6.0, 5.963, 1.233, 0.0]) {
+            for z in [-2, 0, 1, 3] {
+                let felt = pull.at(&mut sampler, 1.0, IVec3::new(r, 0, z)).unwrap();
+                assert!((felt.speed - expected).abs() < 1e-3, "{r} {z} {}", felt.speed);
+            }
         }
     }
 
     #[test]
-    fn single() {
-        for tip in [0.0, 2.5, 4.0] {
-            let target = points([DVec3::new(0.0, 0.0, 6.0)]);
-            let how = Attraction { tip, ..paper() };
-            let (level_set, report) = drawn(&target, &how, Until::Iterations(1000));
-            eprintln!("{tip} {:?} {report:?}", [0.0, 1.0, 2.0, 3.0, 4.0].map(|x| height(&level_set, x, 0.0)));
+    fn a_single_point_is_reached() {
+        let target = points([DVec3::new(0.0, 0.0, 6.0)]);
+        // By the limits alone the flow stalls two voxels before it.
+        let (level_set, report) = drawn(&target, &paper(), Until::Iterations(1000));
+        let apex = height(&level_set, 0.0, 0.0);
+        assert!((3.5..5.0).contains(&apex), "{apex} {report:?}");
+        let (level_set, report) = drawn(&target, &Attraction::default(), Until::Iterations(1000));
+        let apex = height(&level_set, 0.0, 0.0);
+        assert!((apex - 6.0).abs() < REACHED + 0.05 && report.gap < REACHED && !report.stalled, "{apex} {report:?}");
+        // A cone, without a bulb at its tip.
+        let mut sampler = level_set.sampler();
+        for (r, z) in [(3.0, 5.0), (3.0, 6.0), (4.0, 3.0)] {
+            assert!(sampler.trilinear(DVec3::new(r, 0.0, z)) > 0.0, "{r} {z}");
+        }
+    }
+
+    #[test]
+    fn what_is_far_keeps_its_bits_and_threads_change_none() {
+        use crate::stencil::simd::{Isa, choose};
+        let before = ground();
+        let target = points([DVec3::new(5.0, 4.0, 3.0), DVec3::new(7.0, 4.0, 3.0)]);
+        let on = |threads, isa| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let chosen = choose(isa);
+            let (after, _) = pool.install(|| drawn(&target, &Attraction::default(), Until::Iterations(1000)));
+            choose(chosen);
+            after
+        };
+        let bits = |level_set: &LevelSet| {
+            let grid = level_set.grid();
+            grid.leaves().iter().map(|&id| (grid.origin(id), grid.values(id).0.map(f32::to_bits))).collect::<Vec<_>>()
+        };
+        let after = on(1, Isa::Portable);
+        assert!(bits(&after) == bits(&on(3, Isa::Avx2)));
+        for &id in before.grid().leaves() {
+            for offset in before.grid().mask(id).iter() {
+                let ijk = before.grid().origin(id) + offset_to_local(offset);
+                if ijk.x < -14 || ijk.y < -14 || ijk.z < -14 {
+                    assert_eq!(after.grid().voxel(ijk), before.grid().voxel(ijk));
+                }
+            }
         }
     }
 }

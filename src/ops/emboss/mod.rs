@@ -86,7 +86,7 @@ pub struct Emboss {
     pub height: Option<WorldLength>,
     /// Cosines of the angle between the normal and the direction to the target between which the surface begins to be drawn.
     pub angle_limits: [f64; 2],
-    /// Distance from the target within which the surface is drawn whatever its angle; 0 for the angles alone, with which a single point is not reached.
+    /// Distance from the target within which all of the surface that does not face away is drawn; 0 for the angles alone, with which a single point is not reached.
     pub tip: VoxelLength,
     /// Push the surface away from the target instead, for `time`, `iterations` or down to `max_depth`.
     pub repel: bool,
@@ -126,6 +126,9 @@ impl Default for Emboss {
 /// φ(p) is read from the field after every step: it has to be a distance then.
 const SOLVER: SolverOptions =
     SolverOptions { scheme: UpwindScheme::HjWeno5, normalizations: 3, ..SolverOptions::FIRST_ORDER };
+
+/// Most steps where nothing is asked for: the approach to the limit is algebraic, not exponential.
+const MOST_ITERATIONS: u32 = 1000;
 
 /// How far a stamp stands out where nothing is asked for, in voxels.
 const DEFAULT_HEIGHT: f64 = 3.0;
@@ -417,7 +420,7 @@ impl Operator for Emboss {
         let mut outcome = evolved(level_set, run, |level_set| {
             let how = self.attraction(level_set)?;
             let (region, until, solver) =
-                (region.as_deref(), self.evolution.until_rest(), self.evolution.solver(SOLVER));
+                (region.as_deref(), self.evolution.until_rest(MOST_ITERATIONS), self.evolution.solver(SOLVER));
             let report = match source {
                 Source::Solid(_) => attract(level_set, &Solid::new(&tree), &how, region, until, &solver, run)?,
                 _ => attract(level_set, &Surface(&tree), &how, region, until, &solver, run)?,

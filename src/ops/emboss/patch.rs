@@ -1,12 +1,15 @@
 //! A piece of a surface laid flat: the discrete exponential map (Schmidt, Grimm and Wyvill 2006).
 //!
 //! From a seed with its tangent frame, coordinates go from vertex to vertex of the polygonised surface in the order of their distance along
-//! the edges: an edge (q − p), turned into the tangent plane of p without changing its length, is added in the frame of p; the frame
+//! the edges: an edge (q − p), seen along the normal of p, is added in the frame of p; the frame
 //! goes on to q by the smallest rotation that takes the normal of p to that of q. Where several vertices lead to one, their
 //! mean counts. The paths that lead to neighbours may differ: a few rounds of averaging over all neighbours even that out.
 //!
+//! The normals are averaged over a part of the patch first: so it is the surface without its relief that is laid flat, and a stamp
+//! crosses a fold or a ribbon as if it was projected on it. The paper keeps the length of each edge instead, which follows every wrinkle.
+//!
 //! Exact on planes and, up to the polygons, on developable surfaces; on a sphere lengths along the seed's circles are right up
-//! to sin θ/θ. Beyond the radius π/√max K, or on a surface rough at the scale of the patch, it folds: [`Patch::folded`] counts.
+//! to sin θ/θ. Beyond the radius π/√max K it folds: [`Patch::folded`] counts.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -22,8 +25,12 @@ use crate::run::RunOptions;
 /// How much longer paths along edges are than the coordinates that they lead to, at most.
 const DETOUR: f64 = 1.5;
 
-/// Rounds of averaging.
+/// Rounds of averaging of coordinates.
 const ROUNDS: usize = 30;
+
+/// Part of a patch's radius over which its normals are averaged, and most rounds of averaging: a round spreads over an edge, n over √n of them.
+const AVERAGED: f64 = 0.15;
+const MOST_ROUNDS: f64 = 200.0;
 
 /// A patch of a surface with flat coordinates, all in index space.
 pub(super) struct Patch {
@@ -110,8 +117,9 @@ impl Patch {
         }
         let (right, up) = frame(normal)?;
         run.check("emboss")?;
-        let seed = Seed { triangle: triangles[seed_triangle], centre, frame: DMat3::from_cols(right, up, normal) };
-        let coordinates = flattened(&local, &normals, &triangles, &seed, radius * DETOUR);
+        let frame = DMat3::from_cols(right, up, normal);
+        let seed = Seed { triangle: triangles[seed_triangle], centre, frame };
+        let coordinates = flattened(&local, &normals, &triangles, &seed, radius);
         let known = |t: &[u32; 3]| t.iter().all(|&v| coordinates[v as usize].is_some());
         let triangles: Vec<[u32; 3]> = triangles.into_iter().filter(known).collect();
         let coordinates: Vec<DVec2> = coordinates.into_iter().map(Option::unwrap_or_default).collect();
@@ -195,21 +203,33 @@ fn carried(frame: &DMat3, normal: DVec3) -> DMat3 {
     DMat3::from_cols(turned.x_axis, turned.y_axis, normal)
 }
 
-/// An edge in the frame of its first vertex: turned into the tangent plane, its length kept.
+/// An edge in the frame of its first vertex.
 fn unrolled(frame: &DMat3, edge: DVec3) -> DVec2 {
-    let tangential = DVec2::new(edge.dot(frame.x_axis), edge.dot(frame.y_axis));
-    tangential.normalize_or_zero() * edge.length()
+    DVec2::new(edge.dot(frame.x_axis), edge.dot(frame.y_axis))
 }
 
-/// Flat coordinates of the vertices whose path along the edges is at most `farthest`.
+/// Normals averaged over all neighbours, `rounds` times.
+fn averaged(mut normals: Vec<DVec3>, around: &[smallvec::SmallVec<[u32; 8]>], rounds: usize) -> Vec<DVec3> {
+    for _ in 0..rounds {
+        let mean =
+            |at: usize| around[at].iter().fold(normals[at], |sum, &v| sum + normals[v as usize]).normalize_or_zero();
+        normals = (0..normals.len()).into_par_iter().map(mean).collect();
+    }
+    normals
+}
+
+/// Flat coordinates of the vertices within reach of paths along the edges to `radius`.
 fn flattened(
     positions: &[DVec3],
     normals: &[DVec3],
     triangles: &[[u32; 3]],
     seed: &Seed,
-    farthest: f64,
+    radius: f64,
 ) -> Vec<Option<DVec2>> {
+    let farthest = radius * DETOUR;
     let around = neighbours(positions.len(), triangles);
+    let rounds = (radius * AVERAGED).powi(2).min(MOST_ROUNDS) as usize;
+    let normals = averaged(normals.to_vec(), &around, rounds);
     let mut coordinates: Vec<Option<DVec2>> = vec![None; positions.len()];
     let mut frames = vec![DMat3::IDENTITY; positions.len()];
     let mut distance = vec![f64::INFINITY; positions.len()];
