@@ -14,7 +14,6 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use glam::{DVec3, IVec3, Vec3};
-use rayon::prelude::*;
 
 use super::{Field, LevelSet, Sampler};
 use crate::error::{EditError, Result};
@@ -313,16 +312,14 @@ impl<'a> Nodes<'a> {
         if id.is_sentinel() {
             return f64::INFINITY;
         }
-        let mut gather = |reach| {
-            self.for_each_around((id, leaf_offset(voxel)), reach, |node| {
-                if psi[node].is_finite() && normal.dot(self.normals[node]) >= OPPOSED {
-                    near.push((self.points[node] - point, psi[node]));
-                }
-            });
-        };
-        gather(1);
-        if near.is_empty() {
-            gather(REACH);
+        for reach in [1, REACH] {
+            if near.is_empty() {
+                self.for_each_around((id, leaf_offset(voxel)), reach, |node| {
+                    if psi[node].is_finite() && normal.dot(self.normals[node]) >= OPPOSED {
+                        near.push((self.points[node] - point, psi[node]));
+                    }
+                });
+            }
         }
         let squared = |v: &(DVec3, f64)| v.0.length_squared();
         let Some(&(_, nearest)) = near.iter().min_by(|a, b| squared(a).total_cmp(&squared(b))) else {
