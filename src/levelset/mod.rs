@@ -128,7 +128,7 @@ impl LevelSet {
 
     /// Reads φ at any point.
     pub fn sampler(&self) -> Sampler<'_> {
-        Sampler::new(self)
+        Sampler::new(&self.grid, self.voxel_size())
     }
 }
 

@@ -12,7 +12,7 @@ use rustc_hash::FxHashSet;
 
 use super::from_levelset::{leaves_the_band, surface_of};
 use super::nearest::{Band, Leaf, leaves_of_band};
-use super::{Bvh, MeshToLevelSet, level_set_to_mesh, mesh_to_level_set};
+use super::{Bvh, MeshToLevelSet, TriangleMesh, level_set_to_mesh, mesh_to_level_set};
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, MAX_COORD, Transform};
 use crate::levelset::isosurface::IsoSurface;
@@ -155,7 +155,16 @@ pub fn onto_lattice(level_set: &LevelSet, target: &Transform, half_width: f32, r
     if let Some(renamed) = level_set.renamed(target) {
         return with_half_width(&renamed, half_width, run);
     }
-    let mut mesh = level_set_to_mesh(level_set, 0.0, run)?;
+    level_set_of_mesh(level_set_to_mesh(level_set, 0.0, run)?, target, half_width, run)
+}
+
+/// The level set of a mesh (world units) on a given lattice; empty if it has no triangles.
+pub fn level_set_of_mesh(
+    mut mesh: TriangleMesh,
+    target: &Transform,
+    half_width: f32,
+    run: &RunOptions,
+) -> Result<LevelSet> {
     if mesh.triangles.is_empty() {
         return Ok(LevelSet::empty(*target, half_width));
     }

@@ -4,11 +4,14 @@
 //! library's argument and the options of the command; its field documentation is the help. The command line finds operators
 //! in [`REGISTRY`] and knows nothing of any one of them.
 
+pub mod advect;
 pub mod compare;
 mod confine;
 pub mod csg;
 mod curvature;
 pub mod distance;
+pub mod emboss;
+mod keep;
 pub mod morphology;
 mod params;
 mod registry;
@@ -18,7 +21,9 @@ pub mod shape;
 pub mod smooth;
 pub mod smooth_csg;
 mod solver;
+pub mod sweep;
 pub mod transform;
+pub mod warp;
 
 pub use curvature::{CurvatureOptions, Preset};
 pub(crate) use params::words;

@@ -4,7 +4,9 @@
 //! |∇φ| = 1; [`track`] lets the band follow
 //! the surface: dilate, renormalise, trim. A [`Tracker`] does these steps one by one.
 
+mod advect;
 mod anisotropic;
+mod attract;
 mod curvature_flow;
 mod domain;
 mod evolve;
@@ -20,7 +22,9 @@ mod threshold;
 mod track;
 mod tracker;
 
+pub use advect::{VelocityField, advect};
 pub use anisotropic::{AnisotropicGaussian, filter_anisotropic};
+pub use attract::{Attraction, AttractionReport, Attractor, REACHED, attract};
 pub use curvature_flow::{CurvatureFlow, FlowCurvature};
 pub use evolve::{Report, StopReason, Until, evolve};
 pub use filter::{Filter, FilterKind, filter, offset};

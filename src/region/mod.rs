@@ -4,7 +4,7 @@
 //! feathered by default, so that the result stays a distance at the region's rim.
 
 mod field;
-mod files;
+pub(crate) mod files;
 mod near;
 mod plan;
 mod primitive;

@@ -92,9 +92,16 @@ impl VdbFile {
     pub fn read_volume(&self, index: usize, run: &RunOptions) -> Result<Volume> {
         let listing = &self.listing().grids[index];
         let refuse = |problem: String| EditError::input(&self.path, format!("grid `{}`: {problem}", listing.selector));
+        let leaves = ffi::archive_leaves(&self.archive, index).map_err(|e| refuse(e.what().into()))?;
+        self.volume_of(index, &leaves, run)
+    }
+
+    /// The numbers of `leaves`, which are those of grid `index` or a component of them.
+    pub(super) fn volume_of(&self, index: usize, leaves: &ffi::Leaves, run: &RunOptions) -> Result<Volume> {
+        let listing = &self.listing().grids[index];
+        let refuse = |problem: String| EditError::input(&self.path, format!("grid `{}`: {problem}", listing.selector));
         let failed = |e: cxx::Exception| refuse(e.what().into());
         let transform = listing.uniform_transform().map_err(refuse)?;
-        let leaves = ffi::archive_leaves(&self.archive, index).map_err(failed)?;
         let bytes = leaves.count() as u64 * size_of::<LeafValues>() as u64;
         run.reserve("reading a volume", bytes, "take a smaller volume")?;
         let mut flat = vec![0; leaves.count() * 3];
