@@ -349,6 +349,58 @@ fn volumes_become_level_sets_at_a_value() {
 }
 
 #[test]
+fn scans_become_level_sets() {
+    let desk = Desk::new();
+    let mut text =
+        String::from("NRRD0004\ntype: float\ndimension: 3\nsizes: 32 32 17\nspacings: 0.5 0.5 1\nencoding: text\n\n");
+    for i in 0..32 * 32 * 17 {
+        let p =
+            DVec3::new(f64::from(i % 32) - 15.5, f64::from(i / 32 % 32) - 15.5, 2.0 * f64::from(i / 1024) - 16.0) * 0.5;
+        text += &format!("{:.4} ", 100.0 - 10.0 * p.length());
+    }
+    std::fs::write(desk.path("scan.nrrd"), &text).unwrap();
+    let volume = 4.0 / 3.0 * std::f64::consts::PI * 125.0;
+    let found = desk.done(&["convert", "scan.nrrd", "-o", "a.vdb", "--iso", "50", "--check", "--json"]).json();
+    assert!((found["volume_after"].as_f64().unwrap() / volume - 1.0).abs() < 0.03, "{found}");
+    assert!(found["warnings"][0].as_str().unwrap().contains("resampled"), "{found}");
+    assert_eq!(found["voxel_size"], 0.5);
+    let segmented =
+        desk.done(&["segment", "scan.nrrd", "-o", "b.ply", "--iso", "50", "--smoothness", "0.1", "--json"]).json();
+    assert!((segmented["volume_after"].as_f64().unwrap() / volume - 1.0).abs() < 0.03, "{segmented}");
+    let hollow = desk.done(&["convert", "scan.nrrd", "-o", "c.vdb", "--iso", "50", "--invert", "--json"]).json();
+    assert!(hollow["volume_after"].as_f64().unwrap() > 2.0 * volume);
+    let seeded = desk.done(&["segment", "a.vdb", "-o", "d.vdb", "--iso", "0", "--invert", "--json"]);
+    assert_eq!(seeded.code, 0);
+    desk.run(&["convert", "scan.nrrd", "-o", "e.vdb"]).fails(3, &["--iso", "segment"]);
+    desk.run(&["convert", "a.vdb", "-o", "e.vdb", "--iso", "0", "--invert"]).fails(2, &["invert"]);
+    desk.run(&["convert", "scan.nrrd", "-o", "e.vdb", "--iso", "500"]).fails(3, &["no voxel holds more"]);
+    std::fs::write(desk.path("short.nrrd"), &text[..text.len() / 2]).unwrap();
+    desk.run(&["convert", "short.nrrd", "-o", "e.vdb", "--iso", "50"]).fails(3, &["truncated"]);
+    desk.run(&["segment", "short.nrrd", "-o", "e.vdb", "--iso", "50"]).fails(3, &["truncated"]);
+    desk.run(&["segment", "scan.nrrd", "-o", "e.vdb"]).fails(2, &["iso"]);
+}
+
+#[test]
+fn solids_combine() {
+    let desk = Desk::new();
+    let made = |spec: &str| {
+        let made = desk.done(&["shape", spec, "-o", "a.vdb", "--voxel-size", "0.02", "--check", "--json"]).json();
+        made["volume_after"].as_f64().unwrap()
+    };
+    let drilled = made("difference(box size=1,1,1, cylinder radius=0.2 height=2)");
+    assert!((drilled - (1.0 - std::f64::consts::PI * 0.04)).abs() < 0.01, "{drilled}");
+    let (sharp, smooth) = (
+        made("union(sphere radius=0.5, sphere center=0.6,0,0 radius=0.4)"),
+        made("smooth-union(radius=0.2, sphere radius=0.5, sphere center=0.6,0,0 radius=0.4)"),
+    );
+    assert!(smooth > 1.01 * sharp, "{smooth} {sharp}");
+    desk.run(&["shape", "union(sphere radius=1)", "-o", "b.vdb"]).fails(2, &["two or more"]);
+    desk.run(&["shape", "intersection(sphere radius=1, sphere radius=1 center=5,0,0)", "-o", "b.vdb"])
+        .fails(2, &["overlap"]);
+    assert_eq!(desk.names(), ["a.vdb"]);
+}
+
+#[test]
 fn impossible_sizes() {
     let desk = Desk::new();
     desk.cube("cube.obj", "1");
@@ -610,7 +662,55 @@ fn info_writes_curvatures_beside_the_level_set() {
         assert!(desk.done(&["compare", "s.vdb", &out, "--json"]).json()["identical"].as_bool().unwrap());
     }
     desk.run(&["info", "s.vdb", "--write-curvature", "men", "o.vdb"]).fails(2, &["`mean`"]);
-    desk.run(&["info", "s.vdb", "--write-curvature", "mean", "o.obj"]).fails(2, &[".vdb"]);
+    desk.run(&["info", "s.vdb", "--write-curvature", "mean", "o.stl"]).fails(2, &[".vdb", ".ply"]);
+    let colored = desk.done(&["info", "s.vdb", "--write-curvature", "gaussian", "o.ply", "--json"]).json();
+    // Red and blue are full at balls of 8 voxels, 0.8 world units.
+    let full = colored["curvature"]["color_range"][1].as_f64().unwrap();
+    assert!((full - 1.0 / 0.64).abs() < 1e-6, "{full}");
+    assert!(std::fs::read(desk.path("o.ply")).unwrap().windows(3).any(|w| w == b"red"));
     desk.run(&["info", "s.vdb", "mean.vdb", "--write-curvature", "mean", "o.vdb"]).fails(2, &["one input"]);
+    assert!(!desk.path("o.vdb").exists());
+}
+
+#[test]
+fn geodesic_distances_are_a_grid_or_vertex_colours() {
+    let desk = Desk::new();
+    desk.sphere("s.vdb");
+    let found = desk.done(&["geodesic", "s.vdb", "--from", "0,0,1", "-o", "g.vdb", "--json"]).json();
+    // The antipode is π away.
+    let farthest = found["farthest"].as_f64().unwrap();
+    assert!((farthest / std::f64::consts::PI - 1.0).abs() < 0.03 && found["unreachable_voxels"] == 0, "{found}");
+    let listing = vdb_edit::vdb::list(desk.path("g.vdb")).unwrap();
+    let grids: Vec<_> = listing.grids.iter().map(|g| (g.name.as_str(), g.class.as_str())).collect();
+    assert_eq!(grids, [("surface", "level set"), ("geodesic", "unknown")]);
+    // Several points, which may begin with a minus; the nearest counts.
+    let both = desk.done(&["geodesic", "s.vdb", "--from", "0,0,1", "-0.0,0,-1", "-o", "g.ply", "--json"]).json();
+    assert!((both["farthest"].as_f64().unwrap() / farthest - 0.5).abs() < 0.03, "{both}");
+    assert!(std::fs::read(desk.path("g.ply")).unwrap().windows(3).any(|w| w == b"red"));
+    desk.run(&["geodesic", "s.vdb", "--from", "0,0,9", "-o", "o.vdb"])
+        .fails(2, &["from", "closest point on it is 0,0,1"]);
+    desk.run(&["geodesic", "s.vdb", "--from", "0,0,1", "-o", "o.vdb", "--check"]).fails(2, &["check"]);
+    assert!(!desk.path("o.vdb").exists());
+}
+
+#[test]
+fn smooth_csg_and_anisotropic_smoothing_are_reached() {
+    let desk = Desk::new();
+    desk.sphere("a.vdb");
+    desk.done(&["transform", "a.vdb", "--translate", "1.2,0,0", "-o", "b.vdb"]);
+    let plain = desk.done(&["csg", "union", "a.vdb", "b.vdb", "-o", "u.vdb", "--json"]).json();
+    let smooth = ["csg", "smooth-union", "a.vdb", "b.vdb", "-o", "s.vdb", "--radius", "0.4", "--check", "--json"];
+    let smooth = desk.done(&smooth).json();
+    assert!(smooth["volume_after"].as_f64().unwrap() > plain["volume_after"].as_f64().unwrap() * 1.005);
+    desk.run(&["csg", "smooth-union", "a.vdb", "b.vdb", "-o", "o.vdb"]).fails(2, &["radius"]);
+    desk.run(&["csg", "smooth-union", "a.vdb", "b.vdb", "-o", "o.vdb", "--radius", "-1"]).fails(2, &["radius", "-1"]);
+    let method =
+        ["smooth", "u.vdb", "-o", "f.vdb", "--method", "anisotropic", "--sigma", "1,1.5", "--direction", "add"];
+    let filtered = desk.done(&[&method[..], &["--check", "--json"]].concat()).json();
+    assert!(filtered["volume_after"].as_f64().unwrap() > filtered["volume_before"].as_f64().unwrap());
+    assert_eq!(filtered["filtered_in_half_width"], 4.0);
+    desk.run(&["smooth", "u.vdb", "-o", "o.vdb", "--method", "anisotropic", "--sigma", "3,1"]).fails(2, &["sigma"]);
+    desk.run(&["smooth", "u.vdb", "-o", "o.vdb", "--sigma", "1,2"]).fails(2, &["sigma", "anisotropic"]);
+    desk.run(&["smooth", "u.vdb", "-o", "o.vdb", "--preserve-shape"]).fails(2, &["preserve_shape"]);
     assert!(!desk.path("o.vdb").exists());
 }

@@ -21,7 +21,7 @@ use super::shape::sampled;
 use super::solver::{EvolutionOptions, SMOOTHING, evolved};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
-use crate::levelset::shapes::Solid;
+use crate::levelset::expression::Expression;
 use crate::pde::{CurvatureFlow, CutOff, FlowCurvature, Report};
 use crate::run::RunOptions;
 
@@ -77,7 +77,7 @@ impl Operator for Fillet {
                 return Err(EditError::parameter(Self::NAME, "radius", radius, accepted));
             }
         }
-        self.blob.iter().try_for_each(|blob| Solid::parse(blob).map(drop))
+        self.blob.iter().try_for_each(|blob| Expression::parse(blob).map(drop))
     }
 
     fn apply(&self, mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
@@ -109,7 +109,7 @@ impl Fillet {
     /// The level set with the blobs.
     fn seeded(&self, mut level_set: LevelSet, run: &RunOptions) -> Result<LevelSet> {
         for blob in &self.blob {
-            let blob = sampled(&Solid::parse(blob)?, level_set.transform(), level_set.half_width(), run)?;
+            let blob = sampled(&Expression::parse(blob)?, level_set.transform(), level_set.half_width(), run)?;
             level_set = csg(&level_set, &[&blob], CsgOperation::Union, run)?;
         }
         Ok(level_set)

@@ -112,6 +112,11 @@ impl RegionSpecs {
         RegionPlan::parse(&self.0).map(drop)
     }
 
+    /// Whether all of them are neighbourhoods of points and curves.
+    pub fn is_around_curves(&self) -> bool {
+        RegionPlan::parse(&self.0).is_ok_and(|plan| plan.is_some_and(|plan| plan.is_around_curves()))
+    }
+
     /// The region on a level set, or `None` for everywhere. Reads the files that are named.
     pub fn on(&self, level_set: &LevelSet, run: &RunOptions) -> Result<Option<Box<dyn Region>>> {
         RegionPlan::parse(&self.0)?.map(|plan| plan.on(level_set, run)).transpose()

@@ -4,6 +4,9 @@
 //! |∇φ| = 1; [`track`] lets the band follow
 //! the surface: dilate, renormalise, trim. A [`Tracker`] does these steps one by one.
 
+mod advect;
+mod anisotropic;
+mod attract;
 mod curvature_flow;
 mod domain;
 mod evolve;
@@ -15,9 +18,13 @@ mod rest;
 mod sharpen;
 mod speed;
 mod step;
+mod threshold;
 mod track;
 mod tracker;
 
+pub use advect::{VelocityField, advect};
+pub use anisotropic::{AnisotropicGaussian, filter_anisotropic};
+pub use attract::{Attraction, AttractionReport, Attractor, REACHED, attract};
 pub use curvature_flow::{CurvatureFlow, FlowCurvature};
 pub use evolve::{Report, StopReason, Until, evolve};
 pub use filter::{Filter, FilterKind, filter, offset};
@@ -26,6 +33,7 @@ pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
 pub use sharpen::sharpen;
 pub use speed::SpeedFunction;
+pub use threshold::grow_by_threshold;
 pub use track::track;
 pub use tracker::Tracker;
 
