@@ -14,7 +14,9 @@
 //! K itself has the unit 1/length² and does not grow with the matrix where K < 0: only its root is offered.
 //!
 //! On the way to rest (`Until::Rest`) the lower half of C is replaced by max(γ − l₀, 0)/γ ([`CutOff::excess`]): the flow by the excess of
-//! curvature rests where the other does and gets there in steps that do not overshoot.
+//! curvature rests where the other does and gets there in steps that do not overshoot. Its curvatures are those at the foot point on the
+//! surface, κ/(1 − φκ) for each: a concave level set outside the surface is sharper than the surface, would go on when that rests, and
+//! drag it along (the fillet of a right angle became 13 % larger than asked).
 //!
 //! Curvatures are those of [`normals`](crate::stencil::normals), clamped to what the grid resolves, 0 where |∇φ| < 0.1. |∇φ| is
 //! Godunov's with the sign of the final F: a speed that is cut off or one-sided moves fronts, which central differences
@@ -124,7 +126,8 @@ impl SpeedFunction for ToRest {
 
     #[inline(always)]
     fn rate<S: Simd>(&self, simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
-        let (k, gamma) = self.0.curvature.of(simd, &curvatures(simd, halo, x, y, voxel_size), voxel_size);
+        let there = curvatures(simd, halo, x, y, voxel_size);
+        let (k, gamma) = self.0.curvature.of(simd, &there.at_foot(simd, halo.centre(simd, x, y)), voxel_size);
         let speed = self.0.direction.constrain(simd, -k * self.0.cut_off.excess(simd, gamma));
         speed * upwind_gradient(simd, halo, x, y, speed, voxel_size)
     }

@@ -24,6 +24,9 @@ const FLAT_SQUARED: f32 = 0.01;
 /// Keeps 0/0 from staggered normals of flat parts, in squared voxel sizes.
 const LEAST_SQUARED: f32 = 1e-12;
 
+/// The least distance from a focal point, as part of the radius of curvature, that curvatures are continued from.
+const NEAREST_FOCUS: f32 = 0.25;
+
 /// The curvatures of 16 voxels, in 1/world and, for the Gaussian curvature, 1/world².
 pub struct Curvatures<S: Simd> {
     /// H = (κ₁ + κ₂)/2.
@@ -36,6 +39,18 @@ pub struct Curvatures<S: Simd> {
     pub min: Lanes<S>,
     /// The largest |φ| of the 19 voxels, world units: at the background, the stencil has left the band.
     pub reach: Lanes<S>,
+}
+
+impl<S: Simd> Curvatures<S> {
+    /// Those of the surface at the point nearest to each voxel, φ being the distance there: κ/(1 − φκ), as radii of curvature change by φ
+    /// along a normal. Bounded where φ comes near a focal point, which no smooth surface has in its band.
+    #[inline(always)]
+    pub fn at_foot(&self, simd: S, phi: Lanes<S>) -> Self {
+        let (one, least) = (Lanes::splat(simd, 1.0), Lanes::splat(simd, NEAREST_FOCUS));
+        let max = self.max / (one - phi * self.max).max(least);
+        let min = self.min / (one - phi * self.min).max(least);
+        Self { mean: (max + min) * 0.5, gaussian: max * min, max, min, reach: self.reach }
+    }
 }
 
 /// All curvatures of rows (x, y) and (x, y + 1).
