@@ -1,6 +1,7 @@
 //! The one-line grammar of shapes and regions: `sphere center=0,0,1 radius=2`.
 
 use std::cell::Cell;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use glam::{DMat3, DQuat, DVec3};
@@ -167,6 +168,27 @@ pub fn parse_rotation(text: &str) -> Result<DQuat, String> {
     }
 }
 
+/// A specification whose relative files begin in `folder`, and those files.
+///
+/// Files are the values of `file` and, for a `curve`, of `a` and `b`; all else stays as it is, wrong or not.
+pub fn rebased(text: &str, folder: &Path) -> (String, Vec<PathBuf>) {
+    let Some(words) = split(text) else { return (text.into(), Vec::new()) };
+    let curve = words.iter().any(|word| word == "curve");
+    let mut files = Vec::new();
+    let word = |word: &String| match word.split_once('=') {
+        Some((key, value)) if !value.is_empty() && (key == "file" || (curve && matches!(key, "a" | "b"))) => {
+            let path = folder.join(value);
+            let word = format!("{key}=\"{}\"", path.display());
+            files.push(path);
+            word
+        }
+        Some((key, value)) if value.contains(char::is_whitespace) => format!("{key}=\"{value}\""),
+        _ => word.clone(),
+    };
+    let words: Vec<String> = words.iter().map(word).collect();
+    (words.join(" "), files)
+}
+
 /// "did you mean", or the list of what there is.
 pub fn suggest<'a>(given: &str, known: impl Iterator<Item = &'a str>) -> String {
     let known: Vec<&str> = known.collect();
@@ -232,6 +254,17 @@ mod tests {
         assert!(error("sphere center=1,2", |s| s.center().map(drop)).contains("three finite numbers"));
         assert!(error("torus axis=0,0,0", |s| s.axes().map(drop)).contains("not zero"));
         assert!(error("spere", |s| Err(s.unknown_kind(&["sphere", "box"]))).contains("did you mean `sphere`"));
+    }
+
+    #[test]
+    fn files_of_specifications_begin_in_a_folder() {
+        let folder = Path::new("r");
+        let (text, files) = rebased("or curve a=x.vdb b=\"y z.vdb\" d=7,9", folder);
+        assert_eq!(text, "or curve a=\"r/x.vdb\" b=\"r/y z.vdb\" d=7,9");
+        assert_eq!(files, [PathBuf::from("r/x.vdb"), "r/y z.vdb".into()]);
+        assert_eq!(rebased("capsule a=0,0,0 b=1,0,0 radius=1", folder).0, "capsule a=0,0,0 b=1,0,0 radius=1");
+        assert_eq!(rebased("mask file=/m.vdb", folder).1, [PathBuf::from("/m.vdb")]);
+        assert_eq!(rebased("mask file=\"m", folder).0, "mask file=\"m");
     }
 
     #[test]

@@ -71,12 +71,18 @@ impl Volume {
         lerp(slab(0), slab(1), t.x) as f32
     }
 
-    /// World-space box around everything that is stored, with a voxel's rim; `None` if nothing is.
-    pub fn world_bounds(&self) -> Option<(DVec3, DVec3)> {
+    /// First and last voxel of everything that is stored; `None` if nothing is.
+    pub fn index_bounds(&self) -> Option<(IVec3, IVec3)> {
         let leaves = self.leaves.keys().map(|&o| (o, LEAF_DIM));
         let tiles = self.tiles.iter().flat_map(|(size, tiles)| tiles.keys().map(|&o| (o, *size)));
-        let boxes = leaves.chain(tiles).map(|(o, size)| (o - 1, o + size));
-        let (lo, hi) = boxes.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
+        let boxes = leaves.chain(tiles).map(|(o, size)| (o, o + (size - 1)));
+        boxes.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+    }
+
+    /// World-space box around everything that is stored, with a voxel's rim; `None` if nothing is.
+    pub fn world_bounds(&self) -> Option<(DVec3, DVec3)> {
+        let (lo, hi) = self.index_bounds()?;
+        let (lo, hi) = (lo - 1, hi + 1);
         let corners = (0..8).map(|i| {
             let pick = |axis: usize| if i >> axis & 1 == 1 { hi[axis] } else { lo[axis] };
             self.transform.voxel_to_world(IVec3::new(pick(0), pick(1), pick(2)))

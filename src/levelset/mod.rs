@@ -9,6 +9,7 @@ mod components;
 mod curvature;
 mod curve;
 pub(crate) mod dual;
+pub mod expression;
 mod field;
 pub(crate) mod isosurface;
 mod lattice;
@@ -16,6 +17,7 @@ pub(crate) mod marching;
 mod measure;
 pub(crate) mod sample;
 pub mod shapes;
+pub mod smooth_csg;
 mod sweep;
 #[cfg(test)]
 pub(crate) mod testing;

@@ -10,6 +10,7 @@ pub mod files;
 mod findings;
 mod from_levelset;
 mod nearest;
+mod nurbs;
 mod prepare;
 mod quads;
 mod rebuild;

@@ -17,6 +17,7 @@ mod rest;
 mod sharpen;
 mod speed;
 mod step;
+mod threshold;
 mod track;
 mod tracker;
 
@@ -30,6 +31,7 @@ pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
 pub use sharpen::sharpen;
 pub use speed::SpeedFunction;
+pub use threshold::grow_by_threshold;
 pub use track::track;
 pub use tracker::Tracker;
 

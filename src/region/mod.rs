@@ -13,6 +13,7 @@ mod weights;
 use glam::DVec3;
 
 pub use field::{Inside, Painted, Part};
+pub(crate) use files::volume as read_volume;
 pub use near::Near;
 pub use plan::RegionPlan;
 pub use primitive::{HalfSpace, Primitive, Shape};
