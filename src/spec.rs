@@ -172,21 +172,39 @@ pub fn parse_rotation(text: &str) -> Result<DQuat, String> {
 ///
 /// Files are the values of `file` and, for a `curve`, of `a` and `b`; all else stays as it is, wrong or not.
 pub fn rebased(text: &str, folder: &Path) -> (String, Vec<PathBuf>) {
-    let Some(words) = split(text) else { return (text.into(), Vec::new()) };
-    let curve = words.iter().any(|word| word == "curve");
-    let mut files = Vec::new();
-    let word = |word: &String| match word.split_once('=') {
-        Some((key, value)) if !value.is_empty() && (key == "file" || (curve && matches!(key, "a" | "b"))) => {
-            let path = folder.join(value);
-            let word = format!("{key}=\"{}\"", path.display());
-            files.push(path);
-            word
-        }
-        Some((key, value)) if value.contains(char::is_whitespace) => format!("{key}=\"{value}\""),
-        _ => word.clone(),
+    let keys: &[&str] = match text.split_whitespace().any(|word| word == "curve") {
+        true => &["file=", "a=", "b="],
+        false => &["file="],
     };
-    let words: Vec<String> = words.iter().map(word).collect();
-    (words.join(" "), files)
+    let (mut out, mut files) = (String::new(), Vec::new());
+    let mut rest = text;
+    while let Some(space) = rest.find(char::is_whitespace) {
+        let (before, after) = rest.split_at(space + rest[space..].chars().next().map_or(1, char::len_utf8));
+        out.push_str(before);
+        rest = after;
+        let Some(key) = keys.iter().find(|key| rest.starts_with(**key)) else { continue };
+        let value = &rest[key.len()..];
+        // A quoted value ends with its quote; another at a space, or where an expression goes on.
+        let (name, end) = match value.strip_prefix('"') {
+            Some(quoted) => match quoted.find('"') {
+                Some(end) => (&quoted[..end], end + 2),
+                None => continue,
+            },
+            None => {
+                let end = value.find(|c: char| c.is_whitespace() || matches!(c, ',' | ')' | '"'));
+                let end = end.unwrap_or(value.len());
+                (&value[..end], end)
+            }
+        };
+        if !name.is_empty() {
+            let path = folder.join(name);
+            out.push_str(&format!("{key}\"{}\"", path.display()));
+            files.push(path);
+            rest = &value[end..];
+        }
+    }
+    out.push_str(rest);
+    (out, files)
 }
 
 /// "did you mean", or the list of what there is.
@@ -265,6 +283,9 @@ mod tests {
         assert_eq!(rebased("capsule a=0,0,0 b=1,0,0 radius=1", folder).0, "capsule a=0,0,0 b=1,0,0 radius=1");
         assert_eq!(rebased("mask file=/m.vdb", folder).1, [PathBuf::from("/m.vdb")]);
         assert_eq!(rebased("mask file=\"m", folder).0, "mask file=\"m");
+        let (text, files) = rebased("union(bezier file=p.bpt, sphere radius=1, bezier file=q.bpt)", folder);
+        assert_eq!(text, "union(bezier file=\"r/p.bpt\", sphere radius=1, bezier file=\"r/q.bpt\")");
+        assert_eq!(files.len(), 2);
     }
 
     #[test]

@@ -7,6 +7,9 @@
 //! to D = 0, noise and all; the second term holds it back where it would have to bend. It rests where (1 − β) D = β h (κ₁ + κ₂): a ball of R
 //! voxels comes to rest where D = 2β / ((1 − β) R), inside of the edge by that over the slope of D. Time is in steps of a voxel at full speed.
 //!
+//! D is that of the voxel, not of the surface beside it: where it changes sign the level sets of φ bunch up, and each track repairs it only in part. The
+//! result is to be made a distance again by a rebuild.
+//!
 //! Godunov's |∇φ| for D, central differences for the curvature; 1/dt = 1/dt_D + 1/dt_κ with dt_D = ½/(1 − β), dt_κ = 0.9/(6β).
 
 use fearless_simd::{Simd, SimdBase, SimdFloat};
@@ -187,7 +190,6 @@ mod tests {
             // (1 − β)(16 − R)/4 = 2β/R.
             let balance = |r: f64| (1.0 - smoothness) * (16.0 - r) / 4.0 - 2.0 * smoothness / r;
             assert!(balance(radius(&level_set)).abs() < 0.015, "{smoothness}: {}", radius(&level_set));
-            assert!(level_set.check().is_empty());
         }
         let mut level_set = ball(DVec3::ZERO, 8.0);
         let bad = grow_by_threshold(&mut level_set, &|_| 1.0, 1.5, None, Until::Iterations(1), &SOLVER, &run);
