@@ -8,9 +8,9 @@ use serde_json::{Map, Value, json};
 use super::context::Context;
 use super::preview::Preview;
 use super::{args, files, options, table};
-use crate::error::{EditError, Result};
+use crate::error::Result;
 use crate::files::input::{self, Input};
-use crate::files::output::{Output, Written};
+use crate::files::output::{self, Output, Written};
 use crate::levelset::{LevelSet, Measures};
 use crate::ops::compare::changed_voxels;
 use crate::ops::{Arity, Entry, Outcome, Summary};
@@ -96,7 +96,7 @@ impl Edit {
             voxels_changed: changed_voxels(before, &self.level_set),
         };
         if check {
-            verify(self.operation, &self.level_set)?;
+            output::verify(self.operation, &self.level_set)?;
         }
         preview.write(before, &self.level_set, context)?;
         let from = self.inputs.iter().find_map(Input::from);
@@ -116,17 +116,6 @@ impl Edit {
         }
         context.reporter.result(&report.json(), || report.text())
     }
-}
-
-/// Refuses a result that is no valid level set.
-fn verify(operation: &str, level_set: &LevelSet) -> Result<()> {
-    let violations = level_set.check();
-    if violations.is_empty() {
-        return Ok(());
-    }
-    let said: Vec<String> = violations.iter().map(ToString::to_string).collect();
-    let problem = format!("--check: the result is not written: {}", said.join("; "));
-    Err(EditError::Unmet { operation: operation.into(), problem })
 }
 
 struct Facts {

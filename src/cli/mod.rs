@@ -14,6 +14,7 @@ mod convert;
 mod crosscheck;
 mod edit;
 mod files;
+mod geodesic;
 mod info;
 mod options;
 mod preview;
@@ -48,6 +49,7 @@ const VERBS: &[Verb] = &[
     info::VERB,
     convert::VERB,
     compare::VERB,
+    geodesic::VERB,
     render::VERB,
     #[cfg(feature = "openvdb")]
     crosscheck::VERB,

@@ -66,6 +66,12 @@ fn build(command: Command) -> Command {
                 .help("Where relative paths of `write` and `render` begin [default: the recipe's folder]"),
         )
         .arg(
+            Arg::new("check")
+                .long("check")
+                .action(ArgAction::SetTrue)
+                .help("Verify the invariants of what is written; write nothing and exit with 1 if one does not hold"),
+        )
+        .arg(
             Arg::new("dry-run")
                 .long("dry-run")
                 .action(ArgAction::SetTrue)
@@ -96,6 +102,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         frames: matches.get_one::<Frames>("frames").map(|frames| frames.0.clone()).unwrap_or_default(),
         skip_existing: args::flag(matches, "skip-existing"),
         output_folder: args::paths(matches, "output").pop(),
+        check: args::flag(matches, "check"),
         dry_run: args::flag(matches, "dry-run"),
         context,
     };
@@ -139,6 +146,7 @@ struct Job<'a> {
     frames: Vec<i64>,
     skip_existing: bool,
     output_folder: Option<PathBuf>,
+    check: bool,
     dry_run: bool,
     context: &'a Context,
 }
@@ -150,6 +158,9 @@ impl Job<'_> {
         let mut recipe = Recipe::read(&self.path)?;
         if let Some(folder) = &self.output_folder {
             recipe.set_output_folder(folder.clone());
+        }
+        if self.check {
+            recipe.check_outputs();
         }
         for (name, value) in &self.set {
             recipe.set(name, value)?;

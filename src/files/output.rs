@@ -119,6 +119,17 @@ fn kind_of(path: &Path) -> Result<Kind> {
     }
 }
 
+/// Refuses a result that is no valid level set.
+pub fn verify(operation: &str, level_set: &LevelSet) -> Result<()> {
+    let violations = level_set.check();
+    if violations.is_empty() {
+        return Ok(());
+    }
+    let said: Vec<String> = violations.iter().map(ToString::to_string).collect();
+    let problem = format!("--check: the result is not written: {}", said.join("; "));
+    Err(EditError::Unmet { operation: operation.into(), problem })
+}
+
 /// Refuses a path at which nothing can be written, by making a temporary file beside it.
 pub fn writable(path: &Path) -> Result<()> {
     if input::is_pipe(path) {

@@ -274,7 +274,7 @@ mod tests {
         for (form, depth) in [
             (super_elliptic(1.0, 2.0), 0.2929),
             (super_elliptic(1.0, 3.0), 0.2063),
-            (exponential(1.0), 0.6931),
+            (exponential(1.0), std::f64::consts::LN_2),
             (hyperbolic(0.4), 0.4),
         ] {
             assert!((edge_depth(form) - depth).abs() < 5e-5, "{form:?} {}", edge_depth(form));

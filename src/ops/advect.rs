@@ -21,6 +21,7 @@ use crate::run::RunOptions;
 #[serde(default)]
 pub struct Advect {
     /// The `.vdb` with the velocities: a grid of vec3s or vec3d, in world units a unit of time.
+    #[schemars(extend("x-kind" = "FILE"))]
     pub velocity: PathBuf,
     /// The grid in it; the only grid of vectors if not given.
     #[serde(skip_serializing_if = "Option::is_none")]

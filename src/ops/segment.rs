@@ -28,6 +28,7 @@ use crate::scan::{Inside, Scan, is_scan};
 #[serde(default)]
 pub struct Segment {
     /// The volume: a `.vdb` with a float grid, a `.nrrd` or a `.nii`.
+    #[schemars(extend("x-kind" = "FILE"))]
     pub volume: String,
     /// Which grid of a `.vdb`.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -41,6 +41,7 @@ words! {
 pub struct Sweep {
     /// A file of points that the path runs through: a text of `x y z` a line, or an OBJ with one `l` statement.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub path: Option<PathBuf>,
     /// A point that the path runs through, `x,y,z`, instead of a file. Several make a list; the solid is carried from the first on.
     #[schemars(extend("x-list" = true, "x-kind" = "'x,y,z'"))]

@@ -5,6 +5,7 @@
 //! the surface: dilate, renormalise, trim. A [`Tracker`] does these steps one by one.
 
 mod advect;
+mod anisotropic;
 mod attract;
 mod curvature_flow;
 mod domain;
@@ -22,6 +23,7 @@ mod track;
 mod tracker;
 
 pub use advect::{VelocityField, advect};
+pub use anisotropic::{AnisotropicGaussian, filter_anisotropic};
 pub use attract::{Attraction, AttractionReport, Attractor, REACHED, attract};
 pub use curvature_flow::{CurvatureFlow, FlowCurvature};
 pub use evolve::{Report, StopReason, Until, evolve};

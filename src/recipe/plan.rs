@@ -216,7 +216,7 @@ impl Planner<'_, '_> {
 
     /// A file of a parameter: one that is written, or one that is read and must be there.
     fn file(&mut self, name: &str, text: &str, place: &str) -> Result<String> {
-        let is_output = name == "path";
+        let is_output = matches!(self.step.op, Op::Write | Op::Render) && name == "path";
         let folder = match &self.recipe.output_folder {
             Some(folder) if is_output => folder,
             _ => self.recipe.folder(),
@@ -278,6 +278,8 @@ impl Planner<'_, '_> {
             None => String::new(),
         };
         let names = |key: &Key, name: &str| key.name == name || parameter(key) == name;
+        // What a command calls its output is the path of a step.
+        let field = if field == "output" { "path" } else { field };
         // The grammars of shapes and regions do not know whose value they are.
         let of_grammar = |key: &Key| match operation.as_str() {
             "region" => names(key, "region"),

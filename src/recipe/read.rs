@@ -25,6 +25,7 @@ pub struct Recipe {
     /// What `[set]` declares, keyframes included.
     pub(super) variables: Map<String, Value>,
     pub(super) output_folder: Option<PathBuf>,
+    pub(super) check: bool,
 }
 
 /// A key of a step and what it is given.
@@ -57,7 +58,8 @@ impl Recipe {
             let line = error.span().map_or(1, |span| reader.line(span.start));
             EditError::input(path, format!("line {line}: {}", error.message()))
         })?;
-        let mut recipe = Self { path: path.into(), steps: Vec::new(), variables: Map::new(), output_folder: None };
+        let mut recipe =
+            Self { path: path.into(), steps: Vec::new(), variables: Map::new(), output_folder: None, check: false };
         let mut version = None;
         let mut steps = None;
         for (key, value) in table.get_ref() {
@@ -140,6 +142,11 @@ impl Recipe {
     /// Lets relative paths of `write` and `render` begin in another folder than the recipe's.
     pub fn set_output_folder(&mut self, folder: PathBuf) {
         self.output_folder = Some(folder);
+    }
+
+    /// Has every level set that is written verified; one that breaks an invariant stops the run.
+    pub fn check_outputs(&mut self) {
+        self.check = true;
     }
 
     /// The names of `[set]` and their values.

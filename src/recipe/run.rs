@@ -12,12 +12,13 @@ use super::step::Conversion;
 use crate::atomic::{Staging, write_atomically};
 use crate::error::{EditError, Result};
 use crate::files::input::{self, InputOptions};
-use crate::files::output::Output;
+use crate::files::output::{self, Output};
 use crate::files::volume::Volume;
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
 use crate::mesh::{Rebuild, rebuild};
 use crate::ops::{Outcome, Summary, VoxelLength, WorldLength};
 use crate::run::RunOptions;
+use crate::scan::Inside;
 
 /// What a step did.
 #[derive(Clone, Debug, Serialize)]
@@ -72,6 +73,8 @@ struct Running<'a> {
     /// How often each will still be taken.
     uses: Vec<usize>,
     staging: Staging,
+    /// Whether what is written is verified first.
+    check: bool,
     run: &'a RunOptions,
 }
 
@@ -80,7 +83,8 @@ impl Plan<'_> {
     pub fn run(&self, run: &RunOptions, warn: &mut dyn FnMut(&str)) -> Result<FrameReport> {
         let began = Instant::now();
         let uses = self.recipe.steps.iter().map(|step| step.uses).collect();
-        let mut running = Running { slots: Vec::new(), uses, staging: Staging::default(), run };
+        let check = self.recipe.check;
+        let mut running = Running { slots: Vec::new(), uses, staging: Staging::default(), check, run };
         let mut reports = Vec::new();
         for (step, planned) in self.recipe.steps.iter().zip(&self.steps) {
             run.check("run")?;
@@ -143,6 +147,9 @@ impl Running<'_> {
                 let output = Output::plan(place.clone(), target.volume(), &target.mesh())?;
                 let mut summary = Summary::default();
                 for slot in &inputs {
+                    if self.check {
+                        output::verify("write", &slot.level_set)?;
+                    }
                     let from = slot.source.as_ref().map(|source| (&source.0, source.1));
                     let written = output.write(&slot.level_set, 0.0, from, self.run).map_err(|error| match error {
                         EditError::Output { problem, .. } => EditError::output(path, problem),
@@ -209,11 +216,16 @@ impl Running<'_> {
             return Err(EditError::parameter("convert", "input", "", "one file"));
         };
         let options = conversion.options();
+        let inside = if conversion.invert { Inside::Below } else { Inside::Above };
         let bare = |iso: WorldLength| iso.to_string().parse::<f32>().ok();
         if let Some(iso) = conversion.iso.and_then(bare)
-            && let Some(input) = input::load_iso(path, &options, iso, warnings, self.run)?
+            && let Some(input) = input::load_iso(path, &options, iso, inside, warnings, self.run)?
         {
             return Ok(input.into());
+        }
+        if conversion.invert {
+            let accepted = "a volume or scan and `iso`: of other inputs nothing is turned inside out";
+            return Err(EditError::parameter("convert", "invert", true, accepted));
         }
         let inputs = input::load(std::slice::from_ref(path), &options, warnings, self.run)?;
         let mut slot = inputs.into_iter().map(Slot::from).next();

@@ -163,6 +163,8 @@ pub(super) struct Conversion {
     /// The surface at this distance, positive outside; of a volume that is no level set, at this value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub iso: Option<WorldLength>,
+    /// With `iso`, of a volume or scan: what lies below the value is inside.
+    pub invert: bool,
     /// The level set to take: NAME, or NAME[n] where several have it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub grid: Option<String>,

@@ -8,6 +8,7 @@ pub(crate) mod files;
 mod near;
 mod plan;
 mod primitive;
+mod voxels;
 mod weights;
 
 use glam::DVec3;
@@ -17,6 +18,7 @@ pub(crate) use files::volume as read_volume;
 pub use near::Near;
 pub use plan::RegionPlan;
 pub use primitive::{HalfSpace, Primitive, Shape};
+pub use voxels::VoxelSet;
 pub use weights::RegionWeights;
 
 /// A weight in space.

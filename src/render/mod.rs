@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 
 pub use camera::{CameraSpec, Frame, UpAxis};
 pub use png::Image;
-pub use vertices::vertex_colors;
+pub use vertices::{distance_colors, vertex_colors};
 
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;

@@ -41,29 +41,36 @@ use crate::run::RunOptions;
 pub struct Emboss {
     /// Draw the surface to the points of this file: lines of `x y z`, or the vertices of a mesh. Points inside engrave.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub points: Option<PathBuf>,
     /// Draw it to a curve: a text of points in order, the `l` lines of an OBJ, or the paths of an SVG, which are laid on the surface by `at`, `up`, `size` and `height`.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub curve: Option<PathBuf>,
     /// Draw it to the surface of this mesh or level set.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub mesh: Option<PathBuf>,
     /// Draw it to this solid, a mesh or level set: what lies inside of it already is not drawn.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub solid: Option<PathBuf>,
     /// Stamp this PNG: brightness is height.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub image: Option<PathBuf>,
     /// With `image`: dark is high.
     pub invert: bool,
     /// Stamp what the paths of this SVG fill, and its strokes.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub svg: Option<PathBuf>,
     /// Stamp this text; `font` says how. Line breaks centre lines below each other.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub text: Option<String>,
     /// The TrueType or OpenType font of `text`.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub font: Option<PathBuf>,
     /// Where the middle of a stamp goes; the closest point of the surface is taken.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -119,6 +126,9 @@ impl Default for Emboss {
 /// φ(p) is read from the field after every step: it has to be a distance then.
 const SOLVER: SolverOptions =
     SolverOptions { scheme: UpwindScheme::HjWeno5, normalizations: 3, ..SolverOptions::FIRST_ORDER };
+
+/// Most steps where nothing is asked for: the approach to the limit is algebraic, not exponential.
+const MOST_ITERATIONS: u32 = 1000;
 
 /// How far a stamp stands out where nothing is asked for, in voxels.
 const DEFAULT_HEIGHT: f64 = 3.0;
@@ -410,7 +420,7 @@ impl Operator for Emboss {
         let mut outcome = evolved(level_set, run, |level_set| {
             let how = self.attraction(level_set)?;
             let (region, until, solver) =
-                (region.as_deref(), self.evolution.until_rest(), self.evolution.solver(SOLVER));
+                (region.as_deref(), self.evolution.until_rest(MOST_ITERATIONS), self.evolution.solver(SOLVER));
             let report = match source {
                 Source::Solid(_) => attract(level_set, &Solid::new(&tree), &how, region, until, &solver, run)?,
                 _ => attract(level_set, &Surface(&tree), &how, region, until, &solver, run)?,

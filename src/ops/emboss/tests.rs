@@ -96,7 +96,7 @@ fn a_stamp_follows_a_curved_surface() {
     let mut sampler = stamped.sampler();
     // A cap of radius 34 up to the angle 20/30, with walls along the normals.
     for i in 0..12 {
-        let around = f64::from(i) * 0.5236;
+        let around = f64::from(i) * std::f64::consts::FRAC_PI_6;
         let at =
             |theta: f64, r: f64| DVec3::new(theta.cos(), theta.sin() * around.cos(), theta.sin() * around.sin()) * r;
         for theta in [0.0, 0.3, 0.6] {
