@@ -6,7 +6,7 @@
 //! a sphere of 24 voxels, beyond the equator, the error is 0.4 % on average and 1.6 % at most before (an independent computation), and 0.1 % on average after.
 //!
 //! Edges between points whose normals are opposed are left out: they would lead through a thin part, or over a narrow gap. Parts thinner than about two voxels are not told from their other side.
-//! A chord is shorter than the way along the surface by d³/(24R²).
+//! A chord is shorter than the way along the surface by d³/(24R²), over a sharp edge by up to 1.2 voxels.
 //!
 //! Other voxels of the band get their values from their neighbours nearer to the surface, so that ψ is constant along normals.
 
@@ -430,9 +430,9 @@ mod tests {
                 assert!((psi.value(at) - x as f32).abs() < 1e-4, "{at} {}", psi.value(at));
             }
         }
-        // The far side is reached over the edge: 30 + 12 + 30.
+        // The far side is reached over two edges, 30 + 12 + 30, each cut by a chord of up to 2√2 voxels, which saves 1.2.
         let below = psi.value(IVec3::new(0, 0, -6));
-        assert!((below / 72.0 - 1.0).abs() < 0.03, "{below}");
+        assert!(below < 72.0 * 1.02 && below > 72.0 * 0.98 - 2.4, "{below}");
     }
 
     #[test]
