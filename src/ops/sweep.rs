@@ -173,10 +173,10 @@ pub fn sweep(
         let squared = |k: usize| centres[k].distance_squared(ijk);
         let near = (0..places.len()).min_by(|&a, &b| squared(a).total_cmp(&squared(b))).unwrap_or(0);
         let mut least = single(&mut sampler, back[near].transform_point3(ijk));
-        for k in 0..places.len() {
+        for (k, back) in back.iter().enumerate() {
             let reach = least + radius;
             if reach > 0.0 && squared(k) < reach * reach {
-                least = least.min(single(&mut sampler, back[k].transform_point3(ijk)));
+                least = least.min(single(&mut sampler, back.transform_point3(ijk)));
             }
         }
         if let Some(region) = region
