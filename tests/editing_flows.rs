@@ -164,7 +164,6 @@ fn edges_retreat_as_the_self_similar_solution() {
         (FlowCurvature::Convex, false, 0.0),
     ] {
         let level_set = corner(convex);
-        let start = retreat(&level_set, 0.0);
         for time in [4.0f64, 16.0] {
             let expected = sign * 1.04449 * time.sqrt();
             let found = retreat(&moved(&level_set, of(curvature), Until::Time(time)).0, expected);
@@ -177,7 +176,7 @@ fn edges_retreat_as_the_self_similar_solution() {
 fn what_lies_beyond_the_limits_stays() {
     let flow = CurvatureFlow { cut_off: CutOff::NONE.with_low([0.04, 0.06]).unwrap(), ..CurvatureFlow::MEAN };
     // 1/26 < 0.04: nothing moves, and that is noticed after one step.
-    let (same, report) = moved(&ball(26.0), flow, Until::Rest(50));
+    let (_, report) = moved(&ball(26.0), flow, Until::Rest(50));
     assert_eq!((report.stopped, report.steps), (StopReason::AtRest, 1));
     let (lo, hi) = radii(&moved(&ball(26.0), flow, Until::Iterations(30)).0, 26.0);
     assert!(lo > 25.95 && hi < 26.05, "{lo} {hi}");
@@ -192,7 +191,7 @@ fn what_lies_beyond_the_limits_stays() {
     let high = CurvatureFlow { cut_off: CutOff::NONE.with_high([0.03, 0.05]).unwrap(), ..CurvatureFlow::MEAN };
     let add = CurvatureFlow { direction: Direction::Add, ..CurvatureFlow::MEAN };
     for flow in [high, add] {
-        let (same, report) = moved(&ball(16.0), flow, Until::Rest(50));
+        let (_, report) = moved(&ball(16.0), flow, Until::Rest(50));
         assert_eq!((report.stopped, report.steps), (StopReason::AtRest, 1));
     }
     let remove = CurvatureFlow { direction: Direction::Remove, ..CurvatureFlow::MEAN };

@@ -1,7 +1,11 @@
 //! What is promised of every operator, asked of each one in the registry: a new operator is tested by being listed.
 
+mod common;
+
 use glam::{DVec3, IVec3};
 use serde_json::{Map, Value, json};
+use std::sync::OnceLock;
+use tempfile::TempPath;
 use vdb_edit::LevelSet;
 use vdb_edit::grid::{Transform, offset_to_local};
 use vdb_edit::ops::csg::{CsgOperation, csg};
@@ -20,25 +24,53 @@ fn needed(entry: &Entry) -> Map<String, Value> {
         // Off the lattice, so that voxels are computed.
         "transform" => json!({ "steps": ["rotate z,30", "translate 0.123,0,0"] }),
         "segment" => json!({ "volume": scan(), "iso": 0.0 }),
+        "emboss" => json!({ "points": points() }),
+        "warp" => json!({ "handle": ["1.1,0,0:1.2,0.1,0"], "fixed": ["-1,0,0", "0,1,0", "0,0,1"] }),
+        "sweep" => json!({ "through": ["0,0,0", "0.2,0.1,0"] }),
+        "advect" => json!({ "velocity": velocity(), "time": 0.004 }),
         _ => json!({}),
     };
     values.as_object().unwrap().clone()
 }
 
-/// A scan of a ball of 8 voxels, in a file that stays for the whole run.
+/// The operators whose files are at hand: velocities are not among what this repository ships.
+fn operators() -> impl Iterator<Item = &'static Entry> {
+    let velocities = common::shared("vdb").is_some();
+    REGISTRY.iter().filter(move |entry| velocities || entry.name != "advect")
+}
+
+/// A grid of vectors: 0, −15, 0 between 0 and 4 along each axis.
+fn velocity() -> String {
+    common::shared("vdb").map(|folder| folder.join("velocity_vec3s.vdb").display().to_string()).unwrap_or_default()
+}
+
+/// A file that stays for the whole run.
+fn file(place: &'static OnceLock<TempPath>, suffix: &str, text: impl FnOnce() -> String) -> String {
+    let path = place.get_or_init(|| {
+        let mut file = tempfile::Builder::new().suffix(suffix).tempfile().unwrap();
+        std::io::Write::write_all(&mut file, text().as_bytes()).unwrap();
+        file.into_temp_path()
+    });
+    path.display().to_string()
+}
+
+/// Points beside every subject.
+fn points() -> String {
+    static FILE: OnceLock<TempPath> = OnceLock::new();
+    file(&FILE, ".xyz", || "1.4 0.05 0\n0 0.9 0.1\n-1.35 0 0\n".into())
+}
+
+/// A scan of a ball of 8 voxels.
 fn scan() -> String {
-    static FILE: std::sync::OnceLock<tempfile::TempPath> = std::sync::OnceLock::new();
-    let path = FILE.get_or_init(|| {
-        let mut file = tempfile::Builder::new().suffix(".nrrd").tempfile().unwrap();
+    static FILE: OnceLock<TempPath> = OnceLock::new();
+    file(&FILE, ".nrrd", || {
         let mut text = String::from("NRRD0004\ntype: float\ndimension: 3\nsizes: 24 24 24\nencoding: text\n\n");
         for i in 0..24 * 24 * 24 {
             let p = IVec3::new(i % 24, i / 24 % 24, i / 576).as_dvec3() - 11.5;
             text += &format!("{:.3}\n", 8.0 - p.length());
         }
-        std::io::Write::write_all(&mut file, text.as_bytes()).unwrap();
-        file.into_temp_path()
-    });
-    path.display().to_string()
+        text
+    })
 }
 
 fn made(distance: impl Fn(DVec3) -> f64 + Sync) -> LevelSet {
@@ -123,7 +155,7 @@ fn every_operator_and_parameter_is_documented() {
 
 #[test]
 fn defaults_agree_with_the_schema_and_survive_json() {
-    for entry in REGISTRY {
+    for entry in operators() {
         let schema = entry.schema();
         let properties = schema.get("properties").and_then(Value::as_object).unwrap();
         let mut defaults = needed(entry);
@@ -146,7 +178,7 @@ fn defaults_agree_with_the_schema_and_survive_json() {
 #[test]
 fn defaults_given_in_toml_change_nothing() {
     let (_, subject) = &subjects()[2];
-    for entry in REGISTRY {
+    for entry in operators() {
         let mut table = needed(entry);
         for parameter in entry.parameters().into_iter().filter(|p| !p.default.is_null()) {
             table.entry(parameter.name).or_insert(parameter.default);
@@ -160,7 +192,7 @@ fn defaults_given_in_toml_change_nothing() {
 
 #[test]
 fn unknown_parameters_are_refused_with_the_nearest() {
-    for entry in REGISTRY {
+    for entry in operators() {
         for parameter in entry.parameters() {
             let misspelt = format!("{}x", parameter.name);
             let mut values = needed(entry);
@@ -176,7 +208,7 @@ fn unknown_parameters_are_refused_with_the_nearest() {
 
 #[test]
 fn values_of_the_wrong_kind_are_blamed_by_name() {
-    for entry in REGISTRY {
+    for entry in operators() {
         for parameter in entry.parameters() {
             for wrong in [json!({ "a": 1 }), json!([[1]]), json!("no such word, no number")] {
                 if wrong.is_string() && (parameter.kind == "string" || parameter.is_list) {
@@ -197,7 +229,7 @@ fn values_of_the_wrong_kind_are_blamed_by_name() {
 #[test]
 fn the_number_of_inputs_is_checked() {
     let (_, subject) = &subjects()[0];
-    for entry in REGISTRY {
+    for entry in operators() {
         let wrong: &[usize] = match entry.arity {
             Arity::Source => &[1, 2],
             Arity::One => &[0, 2],
@@ -217,7 +249,7 @@ fn results_are_valid_level_sets_and_inputs_stay_as_they_were() {
     for (name, subject) in subjects() {
         assert_eq!(subject.check(), [], "{name}");
         let before = bits(&subject);
-        for entry in REGISTRY {
+        for entry in operators() {
             let result = run(entry, needed(entry), &subject);
             assert_eq!(result.check(), [], "{} of the {name}", entry.name);
             assert!(!result.is_empty(), "{} of the {name}", entry.name);
@@ -229,7 +261,7 @@ fn results_are_valid_level_sets_and_inputs_stay_as_they_were() {
 #[test]
 fn nothing_in_gives_nothing_out() {
     let nothing = LevelSet::empty(Transform::uniform(DX), 3.0);
-    for entry in REGISTRY.iter().filter(|entry| entry.arity != Arity::Source) {
+    for entry in operators().filter(|entry| entry.arity != Arity::Source) {
         let count = if entry.arity == Arity::Many { 2 } else { 1 };
         let outcome = entry.run(needed(entry), vec![nothing.clone(); count], &RunOptions::default());
         let result = outcome.unwrap_or_else(|e| panic!("{}: {e}", entry.name)).level_set;
@@ -242,7 +274,7 @@ fn runs_and_thread_counts_agree_to_the_last_bit() {
     let pool = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     let (one, four) = (pool(1), pool(4));
     for (name, subject) in subjects() {
-        for entry in REGISTRY {
+        for entry in operators() {
             let once = || bits(&run(entry, needed(entry), &subject));
             let alone = one.install(once);
             assert!(alone == one.install(once), "{} of the {name}: two runs", entry.name);
@@ -254,7 +286,7 @@ fn runs_and_thread_counts_agree_to_the_last_bit() {
 #[test]
 fn a_cancelled_run_says_so() {
     let (_, subject) = &subjects()[0];
-    for entry in REGISTRY {
+    for entry in operators() {
         let options = RunOptions::default();
         options.cancel_flag().store(true, std::sync::atomic::Ordering::Relaxed);
         let result = entry.run(needed(entry), inputs(entry, subject), &options);
@@ -268,7 +300,7 @@ fn a_cancelled_run_says_so() {
 fn nothing_happens_outside_the_region() {
     let plan = RegionPlan::parse(&[REGION.into()]).unwrap().unwrap();
     let mut limited = 0;
-    for entry in REGISTRY.iter().filter(|entry| entry.parameters().iter().any(|p| p.name == "region")) {
+    for entry in operators().filter(|entry| entry.parameters().iter().any(|p| p.name == "region")) {
         limited += 1;
         for (name, subject) in subjects() {
             let mut values = needed(entry);

@@ -57,11 +57,6 @@ impl<'a> Sampler<'a> {
         Self { accessor: grid.accessor(), voxel_size, background: grid.background() }
     }
 
-    /// Edge of a voxel in world units.
-    pub(super) fn voxel_size(&self) -> f64 {
-        self.voxel_size
-    }
-
     /// Value of a voxel.
     pub fn voxel(&mut self, ijk: IVec3) -> f32 {
         self.accessor.value(ijk)

@@ -321,7 +321,7 @@ mod tests {
                 }
             }
         }
-        assert!(count > 500, "{count}");
+        assert!(count > 100, "{count}");
         worst
     }
 
@@ -371,15 +371,15 @@ mod tests {
             for at in plain.grid().mask(id).iter() {
                 let ijk = origin + offset_to_local(at);
                 let same = union.grid().voxel(ijk).0 == plain.grid().values(id).0[at];
-                // The blend begins 6 voxels from the other surface; a band and the growth of the set beyond it, nothing changes.
-                if (ijk.x.abs().max(ijk.y.abs()) - 8) > 6 + 12 {
+                // The blend begins 6 voxels from the other surface; nine steps beyond it, nothing changes.
+                if (ijk.x.abs().max(ijk.y.abs()) - 8) > 6 + 9 {
                     assert!(same, "{ijk}");
                     kept += 1;
                 }
                 changed += u32::from(!same);
             }
         }
-        assert!(kept > 1000 && changed > 1000, "{kept} {changed}");
+        assert!(kept > 500 && changed > 1000, "{kept} {changed}");
         // Out of each other's reach nothing is blended at all.
         let run = RunOptions::default();
         let far = [-15.0, 15.0].map(|x| sampled(30, move |p| (p - DVec3::X * x).length() - 8.0));
@@ -392,14 +392,7 @@ mod tests {
 
     #[test]
     fn surfaces_that_do_not_meet_are_joined_only_if_not_limited() {
-        // Two plates with a gap of 2 voxels, and a bar through both.
-        let plates = |p: DVec3| {
-            let plate = DVec3::new(20.0, 20.0, 4.0);
-            box_distance(p - DVec3::Z * 5.0, plate).min(box_distance(p + DVec3::Z * 15.0, plate))
-        };
-        let a = sampled(30, plates);
-        let b = sampled(30, |p| box_distance(p + DVec3::Z * 5.0, DVec3::new(20.0, 5.0, 5.0)));
-        let above = IVec3::new(0, 12, 0);
+        // Two plates with a gap of 2 voxels.
         let upper = sampled(30, |p| box_distance(p - DVec3::Z * 6.0, DVec3::new(20.0, 20.0, 4.0)));
         let lower = sampled(30, |p| box_distance(p + DVec3::Z * 4.0, DVec3::new(20.0, 20.0, 4.0)));
         let joined = smooth(&upper, &lower, Combine::Union, FORM, None);
@@ -409,13 +402,12 @@ mod tests {
         let what = SmoothCsg { combine: Combine::Union, form: FORM, near_curve: Some([4.0, 8.0]) };
         let (apart, _) = smooth_csg(&[&upper, &lower], &plain, &what, &run).unwrap();
         assert!(apart.grid().voxel(IVec3::new(0, 0, 1)).0 > 0.0);
-        // Where surfaces do meet, the limited blend is the same near the curve and nothing far from it.
-        let near = smooth(&a, &b, Combine::Union, FORM, Some([7.0, 9.0]));
-        assert!(
-            near.measure(&run).unwrap().volume
-                > csg(&a, &[&b], CsgOperation::Union, &run).unwrap().measure(&run).unwrap().volume
-        );
-        assert!(near.grid().voxel(above).0.is_finite());
+        // Where surfaces do meet, the limited blend acts near the curve.
+        let (a, b) = (slab(0), slab(1));
+        let plain = csg(&a, &[&b], CsgOperation::Union, &run).unwrap().measure(&run).unwrap().volume;
+        let near = smooth(&a, &b, Combine::Union, FORM, Some([7.0, 9.0])).measure(&run).unwrap().volume;
+        let full = smooth(&a, &b, Combine::Union, FORM, None).measure(&run).unwrap().volume;
+        assert!(near > plain + 100.0 && near < full + 1.0, "{plain} {near} {full}");
     }
 
     #[test]

@@ -355,7 +355,8 @@ fn faces_and_edges(level_set: &LevelSet) -> [f64; 2] {
 #[test]
 fn shapes_are_preserved_where_noise_goes() {
     let noisy = noisy_box();
-    let [rough, _] = faces_and_edges(&noisy);
+    // Its polygons have cut off some of the edges already.
+    let [rough, start] = faces_and_edges(&noisy);
     assert!((rough - 0.33).abs() < 0.05, "{rough}");
     let of = |critical_curvature: Option<f32>, times: u32| {
         let mut level_set = noisy.clone();
@@ -369,7 +370,9 @@ fn shapes_are_preserved_where_noise_goes() {
     {
         let [found_face, found_edge] = of(critical, times);
         assert!((found_face - face).abs() < 0.04, "{critical:?} {times}: faces {found_face}");
-        assert!((found_edge - edge).abs() < 0.3, "{critical:?} {times}: edges {found_edge}");
+        // There the edges start at 0.166.
+        let (retreat, stated) = (found_edge - start, edge - 0.166);
+        assert!((retreat - stated).abs() < 0.3, "{critical:?} {times}: edges {retreat}, {stated}");
     }
 }
 
