@@ -184,7 +184,7 @@ mod tests {
             (json!({ "volume": [2, 1] }), "least value first"),
             (json!({ "volume": 1 }), "volume"),
             (json!({ "components": 1.5 }), "components"),
-            (json!({ "genera": 1 }), "did you mean `genus`"),
+            (json!({ "genuss": 1 }), "did you mean `genus`"),
         ] {
             let error = verify(&ball, values).unwrap_err();
             assert_eq!(error.exit_code(), 2);
