@@ -164,7 +164,6 @@ fn edges_retreat_as_the_self_similar_solution() {
         (FlowCurvature::Convex, false, 0.0),
     ] {
         let level_set = corner(convex);
-        let start = retreat(&level_set, 0.0);
         for time in [4.0f64, 16.0] {
             let expected = sign * 1.04449 * time.sqrt();
             let found = retreat(&moved(&level_set, of(curvature), Until::Time(time)).0, expected);
@@ -177,7 +176,7 @@ fn edges_retreat_as_the_self_similar_solution() {
 fn what_lies_beyond_the_limits_stays() {
     let flow = CurvatureFlow { cut_off: CutOff::NONE.with_low([0.04, 0.06]).unwrap(), ..CurvatureFlow::MEAN };
     // 1/26 < 0.04: nothing moves, and that is noticed after one step.
-    let (same, report) = moved(&ball(26.0), flow, Until::Rest(50));
+    let (_, report) = moved(&ball(26.0), flow, Until::Rest(50));
     assert_eq!((report.stopped, report.steps), (StopReason::AtRest, 1));
     let (lo, hi) = radii(&moved(&ball(26.0), flow, Until::Iterations(30)).0, 26.0);
     assert!(lo > 25.95 && hi < 26.05, "{lo} {hi}");
@@ -192,7 +191,7 @@ fn what_lies_beyond_the_limits_stays() {
     let high = CurvatureFlow { cut_off: CutOff::NONE.with_high([0.03, 0.05]).unwrap(), ..CurvatureFlow::MEAN };
     let add = CurvatureFlow { direction: Direction::Add, ..CurvatureFlow::MEAN };
     for flow in [high, add] {
-        let (same, report) = moved(&ball(16.0), flow, Until::Rest(50));
+        let (_, report) = moved(&ball(16.0), flow, Until::Rest(50));
         assert_eq!((report.stopped, report.steps), (StopReason::AtRest, 1));
     }
     let remove = CurvatureFlow { direction: Direction::Remove, ..CurvatureFlow::MEAN };
@@ -465,10 +464,10 @@ fn what_cannot_work_is_refused() {
     let radius = Some(WorldLength::new(1.0));
     assert!(said(Fillet { radius, flow: low([0.1, 0.2]), ..Fillet::default() }.validate()).contains("either `radius`"));
     assert!(said(Fillet { radius: Some(WorldLength::new(-1.0)), ..Fillet::default() }.validate()).contains("positive"));
-    let far = Blend { d_min: VoxelLength::new(-1.0), ..Blend::default() };
+    let far = Blend { d_min: Some(VoxelLength::new(-1.0)), ..Blend::default() };
     assert!(said(far.validate()).contains("d_min = -1"));
     let (a, b) = &*STANDING;
-    let crossed = Blend { d_min: VoxelLength::new(10.0), ..Blend::default() };
+    let crossed = Blend { d_min: Some(VoxelLength::new(10.0)), ..Blend::default() };
     assert!(blend(a, b, &crossed, &RunOptions::default()).err().unwrap().to_string().contains("at most d_max"));
     let both = EvolutionOptions { iterations: Some(3), max_iterations: Some(9), ..EvolutionOptions::default() };
     assert!(said(Smooth { evolution: both, ..Smooth::default() }.validate()).contains("max_iterations"));
@@ -492,4 +491,49 @@ fn several_blends_follow_one_another() {
     let (near, _) = blend(slab, &other, &Blend { evolution: params, ..Blend::default() }, &run).unwrap();
     // A further region multiplies: it does not reach the second cylinder.
     assert!(near.summary.warnings.iter().any(|w| w.contains("touches no voxel")), "{:?}", near.summary);
+}
+
+#[test]
+fn the_anisotropic_gaussian_fills_the_edge_and_nothing_else() {
+    // Slabs across x and y meet in right angles; the theory has the surface 0.798 s₂ from the edge on the bisector.
+    let slab = |axis: usize| {
+        let mut half = DVec3::splat(22.0);
+        half[axis] = 8.0;
+        sampled(28, move |p| box_distance(p, half))
+    };
+    let (a, b) = (slab(0), slab(1));
+    let run = RunOptions::default();
+    let plain = csg(&a, &[&b], CsgOperation::Union, &run).unwrap();
+    let params = Blend { method: BlendMethod::Gaussian, ..Blend::default() };
+    let (outcome, blended) = blend(&a, &b, &params, &run).unwrap();
+    assert_eq!(outcome.level_set.check(), []);
+    let depth = on_ray(&outcome.level_set, DVec3::new(8.0, 8.0, 0.0), DVec3::new(1.0, 1.0, 0.0).normalize(), 1.8);
+    assert!((depth - 1.795).abs() < 0.1, "{depth}");
+    assert!(blended.volume_added > 0.0 && blended.voxels_touched > 1000);
+    // Beyond 3 s₂ from the curve every voxel keeps its bits.
+    let (mut kept, far) = (0, 3.0 * 2.25 + 1.0);
+    for &id in plain.grid().leaves() {
+        for at in plain.grid().mask(id).iter() {
+            let ijk = plain.grid().origin(id) + offset_to_local(at);
+            let p = ijk.as_dvec3().abs();
+            if (p.x - 8.0).hypot(p.y - 8.0) > far && p.max_element() < 21.0 {
+                assert_eq!(outcome.level_set.grid().voxel(ijk).0, plain.grid().values(id).0[at], "{ijk}");
+                kept += 1;
+            }
+        }
+    }
+    assert!(kept > 1000);
+    // Of a difference it removes.
+    let cut = Blend { operation: CsgOperation::Difference, ..params.clone() };
+    assert!(blend(&a, &b, &cut, &run).unwrap().1.volume_added < 0.0);
+    for (bad, word) in [
+        (Blend { sigma: Some([3.0, 1.0]), ..params.clone() }, "sigma"),
+        (Blend { sigma: Some([1.0, 2.0]), ..Blend::default() }, "only with the method gaussian"),
+        (
+            Blend { evolution: EvolutionOptions { time: Some(1.0), ..EvolutionOptions::default() }, ..params.clone() },
+            "time",
+        ),
+    ] {
+        assert!(bad.validate().unwrap_err().to_string().contains(word), "{word}");
+    }
 }

@@ -474,13 +474,13 @@ fn watching_runs_again_when_a_file_changes() {
 
 /// Voxel sizes that keep this test short; the others run as they are.
 const COARSER: [(&str, &str); 8] = [
-    ("bust", "2.5"),
+    ("bars", "0.04"),
+    ("bust", "2"),
     ("creature", "0.016"),
     ("embossed_teapot", "0.6"),
     ("eye", "1.5"),
     ("offset", "1"),
     ("smoothing_against_opening", "0.08"),
-    ("spout", "0.75"),
     ("winged_cow", "0.016"),
 ];
 

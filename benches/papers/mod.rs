@@ -221,7 +221,7 @@ fn box_and_torus(run: &RunOptions) -> Result<()> {
     let volume = [180, 81, 180];
 
     let row = Row { name: "box + torus, anisotropic σ 2, 3", volume, target: 0.2, paper: "72" };
-    let filter = ours("blend", json!({ "method": "gaussian", "sigma": "2,3" }), &[&bar, &ring], run);
+    let filter = ours("blend", json!({ "method": "gaussian", "sigma": [2, 3] }), &[&bar, &ring], run);
     if let Ok(times) = &filter {
         let gaussian = |mut grid: ReferenceGrid| Ok(grid.apply(Filter::Gaussian(3), &FIRST)?);
         print(&row, *times, Some(timed(|| Ok(grid.duplicate()?), gaussian)?[0]));

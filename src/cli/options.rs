@@ -71,6 +71,11 @@ fn option_of(parameter: &Parameter) -> Arg {
             .hide_possible_values(true),
         // The words are shown as possible values.
         Kind::Words(_) => arg.value_name(parameter.name.to_uppercase()),
+        // Entries of lists may be places, whose first number may be negative.
+        Kind::Text if parameter.is_list => arg
+            .value_name(kind.value_name(parameter))
+            .allow_hyphen_values(true)
+            .value_parser(ValueParser::new(|text: &str| not_an_option(text).map(Value::String))),
         _ => arg.value_name(kind.value_name(parameter)).allow_hyphen_values(kind.may_be_negative()),
     };
     let arg = if parameter.is_list { arg.action(ArgAction::Append) } else { arg };

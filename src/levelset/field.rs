@@ -35,7 +35,7 @@ impl Field {
     /// Trilinear interpolation in index space over the voxels that have a value; `None` where none of a cell's has.
     pub fn trilinear(accessor: &mut Accessor<'_>, ijk: DVec3) -> Option<f32> {
         let limit = f64::from(MAX_COORD - 2);
-        if !(ijk.abs().max_element() < limit) {
+        if ijk.is_nan() || ijk.abs().max_element() >= limit {
             return None;
         }
         let (cell, t) = (ijk.floor(), ijk - ijk.floor());

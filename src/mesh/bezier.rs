@@ -96,7 +96,7 @@ impl BezierPatches {
     /// Triangles within `tolerance` (world units) of the surface, without cracks between patches that share an edge.
     pub fn tessellate(&self, tolerance: f64, run: &RunOptions) -> Result<TriangleMesh> {
         let segments: Vec<[f64; 2]> = self.patches.iter().map(|patch| patch.segments(tolerance / STRIP)).collect();
-        if let Some(most) = segments.iter().flatten().copied().find(|n| !(*n <= MOST_SEGMENTS)) {
+        if let Some(most) = segments.iter().flatten().copied().find(|n| n.is_nan() || *n > MOST_SEGMENTS) {
             let accepted =
                 format!("a tolerance that {MOST_SEGMENTS} segments along a patch reach; this one needs {most}");
             return Err(EditError::parameter("tessellate", "tolerance", tolerance, accepted));

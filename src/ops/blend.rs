@@ -8,6 +8,8 @@
 //! of 90° rests as an arc of radius 1/(2γ) under `curvature`, 1/γ under `fillet`, γ the lower limit, if d_max is at least that far; otherwise
 //! the region shapes it. The limits of `curvature` are those of the paper; those of `fillet` are set for a radius of d_min.
 //!
+//! `gaussian` takes an anisotropic Gaussian ([`filter_anisotropic`]) instead of a flow, whose kernels fade with D_p.
+//!
 //! d is measured to the curve and not to both surfaces, so that surfaces that come near each other without meeting are not
 //! joined. Beyond d_max the result has the bits of `csg`. Where faces coincide the curve is a patch: the region is then wider, and rests as it is flat.
 
@@ -22,7 +24,7 @@ use super::registry::{Arity, Operator, Outcome, Summary};
 use super::solver::{EvolutionOptions, SMOOTHING, evolved};
 use crate::error::{EditError, Result};
 use crate::levelset::{CurvatureKind, LevelSet, curvature_of, curve_length};
-use crate::pde::{CurvatureFlow, CutOff, Direction, FlowCurvature};
+use crate::pde::{AnisotropicGaussian, CurvatureFlow, CutOff, Direction, FlowCurvature, filter_anisotropic};
 use crate::region::{Combined, Near, Region, RegionWeights};
 use crate::run::RunOptions;
 
@@ -33,6 +35,8 @@ words! {
         Curvature = "curvature",
         /// The sum of concave curvatures, or of convex ones where material is removed.
         Fillet = "fillet",
+        /// An anisotropic Gaussian instead of a flow.
+        Gaussian = "gaussian",
     }
 }
 
@@ -42,12 +46,19 @@ words! {
 pub struct Blend {
     /// What to do with the second input, and then with each further one.
     pub operation: CsgOperation,
-    /// How to blend: `curvature` by mean curvature or what `curvature` says, `fillet` by the concave curvatures alone (the convex ones where material is removed).
+    /// How to blend: `curvature` by mean curvature or what `curvature` says, `fillet` by the concave curvatures alone (the convex ones where material is removed),
+    /// `gaussian` by one pass, or as many as `iterations` says, of a Gaussian along the surface, which is far faster.
     pub method: BlendMethod,
-    /// Distance from the curve within which the flow acts in full.
-    pub d_min: VoxelLength,
-    /// Distance from the curve beyond which nothing changes.
-    pub d_max: VoxelLength,
+    /// Distance from the curve within which it acts in full; 7 voxels if not given, of `gaussian` half of `d_max`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub d_min: Option<VoxelLength>,
+    /// Distance from the curve beyond which nothing changes; 9 voxels if not given, of `gaussian` 3 s₂.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub d_max: Option<VoxelLength>,
+    /// Of `gaussian`: standard deviations along the normal and along the surface in voxels, the first not larger; 1.5,2.25 if not given. A right-angled edge is
+    /// filled up to 0.8 s₂ from it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sigma: Option<[f32; 2]>,
     #[serde(flatten)]
     #[allow(missing_docs)]
     pub flow: CurvatureOptions,
@@ -62,8 +73,9 @@ impl Default for Blend {
         Self {
             operation: CsgOperation::Union,
             method: BlendMethod::Curvature,
-            d_min: VoxelLength::new(7.0),
-            d_max: VoxelLength::new(9.0),
+            d_min: None,
+            d_max: None,
+            sigma: None,
             flow: CurvatureOptions::default(),
             evolution: EvolutionOptions::default(),
         }
@@ -87,12 +99,37 @@ impl Operator for Blend {
 
     fn validate(&self) -> Result<()> {
         self.evolution.validate(Self::NAME)?;
-        let (low, high) = (self.d_min.voxels(1.0), self.d_max.voxels(1.0));
-        if !(low >= 0.0 && low.is_finite()) {
-            return Err(EditError::parameter(Self::NAME, "d_min", self.d_min, "a length of 0 or more, such as 7"));
+        if let Some(low) = self.d_min
+            && !(low.voxels(1.0) >= 0.0 && low.voxels(1.0).is_finite())
+        {
+            return Err(EditError::parameter(Self::NAME, "d_min", low, "a length of 0 or more, such as 7"));
         }
-        if !(high > 0.0 && high.is_finite()) {
-            return Err(EditError::parameter(Self::NAME, "d_max", self.d_max, "a positive length, such as 9"));
+        if let Some(high) = self.d_max
+            && !(high.voxels(1.0) > 0.0 && high.voxels(1.0).is_finite())
+        {
+            return Err(EditError::parameter(Self::NAME, "d_max", high, "a positive length, such as 9"));
+        }
+        match (self.gaussian(), self.sigma) {
+            (Some(gaussian), _) => {
+                gaussian.validate(Self::NAME)?;
+                if let Some(time) = self.evolution.time {
+                    let accepted = "`iterations` instead: a filter has no time";
+                    return Err(EditError::parameter(Self::NAME, "time", time, accepted));
+                }
+                if let Some(most) = self.evolution.max_iterations {
+                    let accepted = "`iterations` instead: a filter does not stop by itself";
+                    return Err(EditError::parameter(Self::NAME, "max_iterations", most, accepted));
+                }
+                let flow = CurvatureOptions { direction: None, ..self.flow.clone() };
+                if flow != CurvatureOptions::default() {
+                    return Err(flow.misplaced(Self::NAME, "with the methods curvature and fillet"));
+                }
+            }
+            (None, Some([a, b])) => {
+                let accepted = "only with the method gaussian";
+                return Err(EditError::parameter(Self::NAME, "sigma", format!("{a},{b}"), accepted));
+            }
+            _ => {}
         }
         if self.method == BlendMethod::Fillet {
             let accepted =
@@ -127,20 +164,43 @@ impl Blend {
     fn own(&self) -> (FlowCurvature, Direction) {
         let adds = self.operation == CsgOperation::Union;
         let curvature = match (self.method, adds) {
-            (BlendMethod::Curvature, _) => FlowCurvature::Mean,
+            (BlendMethod::Curvature | BlendMethod::Gaussian, _) => FlowCurvature::Mean,
             (BlendMethod::Fillet, true) => FlowCurvature::Concave,
             (BlendMethod::Fillet, false) => FlowCurvature::Convex,
         };
         (curvature, if adds { Direction::Add } else { Direction::Remove })
     }
 
+    /// The filter, if that is the method.
+    fn gaussian(&self) -> Option<AnisotropicGaussian> {
+        (self.method == BlendMethod::Gaussian).then(|| AnisotropicGaussian {
+            sigma: self.sigma.unwrap_or(AnisotropicGaussian::DEFAULT_SIGMA),
+            critical_curvature: None,
+            direction: self.flow.direction.unwrap_or(self.own().1),
+            fades_kernels: true,
+        })
+    }
+
+    /// Between which distances from the curve it fades, in world units.
+    fn reach(&self, voxel_size: f64) -> [f64; 2] {
+        let world =
+            |given: Option<VoxelLength>, voxels: f64| given.unwrap_or(VoxelLength::new(voxels)).world(voxel_size);
+        match self.gaussian() {
+            None => [world(self.d_min, 7.0), world(self.d_max, 9.0)],
+            Some(gaussian) => {
+                let most = world(self.d_max, 3.0 * f64::from(gaussian.sigma[1]));
+                [self.d_min.map_or(most / 2.0, |d| d.world(voxel_size)), most]
+            }
+        }
+    }
+
     /// What moves the surface.
     fn driven(&self, voxel_size: f64) -> Result<CurvatureFlow> {
         let (curvature, direction) = self.own();
         let low = match self.method {
-            BlendMethod::Curvature => LOW,
+            BlendMethod::Curvature | BlendMethod::Gaussian => LOW,
             // An arc that meets the planes of a right angle at d_min.
-            BlendMethod::Fillet => [1.0, RAMP].map(|k| k / self.d_min.voxels(voxel_size).max(1.0)),
+            BlendMethod::Fillet => [1.0, RAMP].map(|k| k / (self.reach(voxel_size)[0] / voxel_size).max(1.0)),
         };
         let refuse = |accepted| EditError::parameter(Self::NAME, "curvature_low", format!("{low:?}"), accepted);
         let cut_off = CutOff::NONE.with_low(low).map_err(refuse)?;
@@ -187,14 +247,10 @@ pub fn blend(first: &LevelSet, second: &LevelSet, params: &Blend, run: &RunOptio
         let summary = Summary { warnings: vec![warning], ..Summary::default() };
         return Ok((Outcome { level_set: joined, summary }, Blended::default()));
     }
-    let reach = [params.d_min, params.d_max].map(|d| d.world(voxel_size));
+    let reach = params.reach(voxel_size);
     if reach[0] > reach[1] {
-        return Err(EditError::parameter(
-            Blend::NAME,
-            "d_min",
-            params.d_min,
-            format!("at most d_max, {}", params.d_max),
-        ));
+        let [low, high] = reach.map(|d| VoxelLength::new(d / voxel_size));
+        return Err(EditError::parameter(Blend::NAME, "d_min", low, format!("at most d_max, {high}")));
     }
     let mut region: Box<dyn Region> = Box::new(Near::new(&curve, reach)?);
     if let Some(further) = params.evolution.region.on(&joined, run)? {
@@ -204,8 +260,13 @@ pub fn blend(first: &LevelSet, second: &LevelSet, params: &Blend, run: &RunOptio
     let until = params.evolution.until_rest((STEPS * spread * spread).min(MOST_STEPS).ceil() as u32);
     let flow = params.driven(voxel_size)?;
     let solver = params.evolution.solver(SMOOTHING);
-    let outcome =
-        evolved(joined.clone(), run, |level_set| flow.evolve(level_set, Some(&*region), until, &solver, run))?;
+    let outcome = evolved(joined.clone(), run, |level_set| match params.gaussian() {
+        None => flow.evolve(level_set, Some(&*region), until, &solver, run),
+        Some(what) => {
+            let (times, solver) = (params.evolution.iterations.unwrap_or(1), params.evolution.solver(what.repair()));
+            filter_anisotropic(level_set, &what, times, Some(&*region), &solver, run)
+        }
+    })?;
     let Change { voxels, volume } = change(&joined, &outcome.level_set);
     let blended = Blended {
         curve_length: curve_length(&curve, voxel_size),

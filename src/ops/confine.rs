@@ -64,6 +64,36 @@ pub(super) fn confined(
     Ok(Some(Merge::new(level_set, rebuilt.grid(), region, around).result(&touched)))
 }
 
+/// `edited`, whose operator has weighed the region itself, but for the voxels that were active in `original` with α = 0: those keep their
+/// bits, and the field beside them is cut to what they allow. Both on one lattice.
+pub(super) fn kept(original: &LevelSet, mut edited: LevelSet, region: &dyn Region) -> LevelSet {
+    let (old, new) = (original.grid(), edited.grid().clone());
+    let merge = Merge::new(original, &new, region, None);
+    // Leaves whose kept voxels the edited field lost.
+    let lost = |origin: &IVec3| new.find(*origin).is_sentinel() && !merge.kept(old.find(*origin)).is_empty();
+    let lost: Vec<IVec3> = old.leaves().iter().map(|&id| old.origin(id)).filter(lost).collect();
+    edited.grid_mut().add_leaves(&lost);
+    let grid = edited.grid().clone();
+    let here: LeafSet = grid.leaf_set().iter().filter(|&id| !old.find(grid.origin(id)).is_sentinel()).collect();
+    edited.grid_mut().update(&here, |id, values, mask| {
+        let from = old.find(grid.origin(id));
+        for at in merge.kept(from).iter() {
+            values.0[at] = old.values(from).0[at];
+            mask.set(at, true);
+        }
+    });
+    drop(grid);
+    let grid = edited.grid();
+    let edited_here = |id: &LeafId| match old.find(grid.origin(*id)) {
+        from if from.is_sentinel() => true,
+        from => !merge.weights.positive(from).is_empty(),
+    };
+    let mut changed: LeafSet = grid.leaves().iter().copied().filter(edited_here).collect();
+    merge.cut_to_kept(&mut edited, &mut changed);
+    edited.grid_mut().prune(&changed);
+    edited
+}
+
 /// φ ← (1 − α) φ + α φ_new where α > 0.
 fn blend(level_set: &mut LevelSet, weights: &RegionWeights, new: &Grid) {
     let before = level_set.grid().clone();
@@ -279,5 +309,35 @@ impl<'a> Merge<'a> {
             }
         }
         cut
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DMat3;
+
+    use super::*;
+    use crate::levelset::testing::ball;
+    use crate::region::{Primitive, Shape};
+
+    #[test]
+    fn what_a_region_leaves_out_keeps_its_bits() {
+        let (before, after) = (ball(DVec3::ZERO, 12.0), ball(DVec3::X * 3.0, 12.0));
+        let shape = Shape::Box { half_size: DVec3::new(20.0, 40.0, 40.0) };
+        let region = Primitive::new(shape, DVec3::X * 20.0, DMat3::IDENTITY, [0.9, 1.0]).unwrap();
+        let mixed = kept(&before, after.clone(), &region);
+        let (mut same, mut new) = (0, 0);
+        for &id in before.grid().leaves() {
+            for offset in (0..LEAF_VOXELS).filter(|o| before.grid().mask(id).get(*o)) {
+                let ijk = before.grid().origin(id) + offset_to_local(offset);
+                if region.weight(ijk.as_dvec3()) == 0.0 {
+                    assert_eq!(mixed.grid().voxel(ijk), before.grid().voxel(ijk));
+                    same += 1;
+                } else if mixed.grid().voxel(ijk) == after.grid().voxel(ijk) {
+                    new += 1;
+                }
+            }
+        }
+        assert!(same > 1000 && new > 1000);
     }
 }

@@ -13,7 +13,6 @@ mod curvature;
 pub mod distance;
 pub mod emboss;
 pub mod fillet;
-mod keep;
 pub mod morphology;
 mod params;
 mod registry;

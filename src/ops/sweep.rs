@@ -13,8 +13,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
+use super::confine::kept;
 use super::emboss::read_polylines;
-use super::keep::kept;
 use super::params::{Vector, words};
 use super::registry::{Arity, Operator, Outcome, Summary};
 use super::solver::RegionSpecs;
@@ -44,8 +44,8 @@ pub struct Sweep {
     #[schemars(extend("x-kind" = "FILE"))]
     pub path: Option<PathBuf>,
     /// A point that the path runs through, `x,y,z`, instead of a file. Several make a list; the solid is carried from the first on.
-    #[schemars(extend("x-list" = true, "x-kind" = "'x,y,z'"))]
-    pub through: Vec<String>,
+    #[schemars(extend("x-list" = true, "x-kind" = "x,y,z"))]
+    pub through: Vec<Vector>,
     /// Whether the solid turns with the `path` or not (`none`).
     pub turning: Turning,
     /// Where material may be added; everywhere if not given.
@@ -82,10 +82,7 @@ impl Sweep {
                 }
                 lines.pop().unwrap_or_default()
             }
-            None => {
-                let point = |t: &String| t.parse::<Vector>().map(|v| v.0).map_err(|e| refuse("through", t.clone(), e));
-                self.through.iter().map(point).collect::<Result<_>>()?
-            }
+            None => self.through.iter().map(|p| p.0).collect(),
         };
         let mut distinct = points;
         distinct.dedup();
@@ -176,10 +173,10 @@ pub fn sweep(
         let squared = |k: usize| centres[k].distance_squared(ijk);
         let near = (0..places.len()).min_by(|&a, &b| squared(a).total_cmp(&squared(b))).unwrap_or(0);
         let mut least = single(&mut sampler, back[near].transform_point3(ijk));
-        for k in 0..places.len() {
+        for (k, back) in back.iter().enumerate() {
             let reach = least + radius;
             if reach > 0.0 && squared(k) < reach * reach {
-                least = least.min(single(&mut sampler, back[k].transform_point3(ijk)));
+                least = least.min(single(&mut sampler, back.transform_point3(ijk)));
             }
         }
         if let Some(region) = region
@@ -203,7 +200,7 @@ pub fn sweep(
     drop(task);
     let result = rebuild(&union, &Rebuild::band(half_width), run)?;
     let result = match region {
-        Some(region) => kept(result, level_set, region, run)?,
+        Some(region) => kept(level_set, result, region),
         None => result,
     };
     Ok((result, places.len()))
@@ -315,7 +312,7 @@ mod tests {
     use crate::levelset::testing::{ball, box_distance, sampled};
 
     fn swept(level_set: &LevelSet, points: &[[f64; 3]], turning: Turning) -> LevelSet {
-        let through = points.iter().map(|p| format!("{},{},{}", p[0], p[1], p[2])).collect();
+        let through = points.iter().map(|p| Vector(DVec3::from(*p))).collect();
         let params = Sweep { through, turning, ..Sweep::default() };
         params.validate().unwrap();
         let result = params.apply(vec![level_set.clone()], &RunOptions::default()).unwrap().level_set;
@@ -407,7 +404,7 @@ mod tests {
     fn a_region_keeps_what_it_leaves_out() {
         let ball = ball(DVec3::ZERO, 8.0);
         let region = RegionSpecs(vec!["halfspace point=12,0,0 normal=1,0,0".into()]);
-        let params = Sweep { through: vec!["0,0,0".into(), "30,0,0".into()], region, ..Sweep::default() };
+        let params = Sweep { through: vec![Vector(DVec3::ZERO), Vector(DVec3::X * 30.0)], region, ..Sweep::default() };
         let cut = params.apply(vec![ball.clone()], &RunOptions::default()).unwrap().level_set;
         assert_eq!(cut.check(), []);
         assert!(cut.sampler().trilinear(DVec3::X * 9.0) < 0.0 && cut.sampler().trilinear(DVec3::X * 14.0) > 0.0);
@@ -423,8 +420,11 @@ mod tests {
                 .map(|e| e.exit_code())
         };
         assert_eq!(code(Sweep::default()), Some(2));
-        assert_eq!(code(Sweep { through: vec!["0,0,0".into(), "0,0,0".into()], ..Sweep::default() }), Some(2));
+        assert_eq!(code(Sweep { through: vec![Vector(DVec3::ZERO); 2], ..Sweep::default() }), Some(2));
         assert_eq!(code(Sweep { path: Some("absent.xyz".into()), ..Sweep::default() }), Some(3));
-        assert_eq!(code(Sweep { through: vec!["0,0,0".into(), "1e9,0,0".into()], ..Sweep::default() }), Some(2));
+        assert_eq!(
+            code(Sweep { through: vec![Vector(DVec3::ZERO), Vector(DVec3::X * 1e9)], ..Sweep::default() }),
+            Some(2)
+        );
     }
 }

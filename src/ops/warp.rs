@@ -17,7 +17,7 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::keep::kept;
+use super::confine::kept;
 use super::params::Vector;
 use super::registry::{Arity, Operator, Outcome, Summary};
 use super::solver::RegionSpecs;
@@ -35,8 +35,8 @@ pub struct Warp {
     #[schemars(extend("x-list" = true, "x-kind" = "'x,y,z:x,y,z'"))]
     pub handle: Vec<String>,
     /// A point that stays. Several make a list.
-    #[schemars(extend("x-list" = true, "x-kind" = "'x,y,z'"))]
-    pub fixed: Vec<String>,
+    #[schemars(extend("x-list" = true, "x-kind" = "x,y,z"))]
+    pub fixed: Vec<Vector>,
     /// Where to act, and how strongly: the displacement is multiplied by the weight, so that a wide soft edge (`soft=0.2,1`) makes a gentle falloff. Everywhere if not given.
     pub region: RegionSpecs,
 }
@@ -63,9 +63,7 @@ impl Warp {
             let (from, to) = (point(from)?, point(to)?);
             pairs.push((from, to - from));
         }
-        for text in &self.fixed {
-            pairs.push((text.parse::<Vector>().map_err(|e| refuse("fixed", text, e))?.0, DVec3::ZERO));
-        }
+        pairs.extend(self.fixed.iter().map(|p| (p.0, DVec3::ZERO)));
         Ok(pairs)
     }
 }
@@ -153,7 +151,7 @@ pub fn warp(
     mesh.positions = moved.into_iter().map(|m| m.0).collect();
     let warped = level_set_of_mesh(mesh, level_set.transform(), level_set.half_width(), run)?;
     let warped = match region {
-        Some(region) => kept(warped, level_set, region, run)?,
+        Some(region) => kept(level_set, warped, region),
         None => warped,
     };
     Ok((warped, Some(least)))
@@ -238,7 +236,7 @@ mod tests {
         let text = |p: &[f64; 3]| format!("{},{},{}", p[0], p[1], p[2]);
         Warp {
             handle: list.iter().map(|(a, b)| format!("{}:{}", text(a), text(b))).collect(),
-            fixed: fixed.iter().map(text).collect(),
+            fixed: fixed.iter().map(|p| Vector(DVec3::from(*p))).collect(),
             ..Warp::default()
         }
     }

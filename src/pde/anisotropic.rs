@@ -318,7 +318,7 @@ impl Work for PassWork<'_> {
                             let found = curvatures(simd, block, x, y, voxel_size);
                             let bend = found.max.abs().max(found.min.abs()) * scale;
                             let squared = bend * bend;
-                            across = across / (one + squared * squared);
+                            across /= one + squared * squared;
                             along = along.min(across);
                         }
                         if let Some(weights) = source.fade {

@@ -9,7 +9,7 @@
 //!
 //! C rises from 0 to 1 between two cosines, so that only what faces the target moves: a target at height d above a plane draws a
 //! disc of radius d·tan(arccos γ). Near the target that disc shrinks to a voxel, and a single point would never be reached. So within
-//! a few voxels of the target (`tip`) everything that does not face away is drawn: the limits fall to 0 and 0.2.
+//! a few voxels of the target (`tip`) everything that does not face away is drawn: the limits fall to 0 and 0.2; beside the target everything is.
 //!
 //! F depends on the normal: where C rises, a change of the normal travels along the surface towards the target at the speed |φ(p)| C′(γ) |u − (n·u)n|,
 //! many times faster than the surface itself moves. So the normal is taken a voxel upwind of y, and that speed bounds the step as well: with central
@@ -18,6 +18,7 @@
 //! Pushed surfaces move by −F, faster and faster: a largest depth, measured from where the surface was, or a time ends it.
 
 use glam::{DVec3, IVec3};
+use rustc_hash::FxHashSet;
 
 use super::evolve::{Motion, Report, StopReason, Until, drive};
 use super::morph::{FirstOrder, MorphSpeed, MorphStep};
@@ -25,7 +26,9 @@ use super::step::Target;
 use super::tracker::Tracker;
 use super::{CutOff, SolverOptions, TimeIntegrator};
 use crate::error::Result;
-use crate::grid::{Grid, LEAF_DIM, LeafId, LeafSet, LeafValues, PageLeaves, Paged, offset_to_local};
+use crate::grid::{
+    Grid, LEAF_DIM, LeafId, LeafSet, LeafValues, PageLeaves, Paged, Transform, leaf_origin, offset_to_local,
+};
 use crate::levelset::{LevelSet, Sampler};
 use crate::region::{Region, ramp_between};
 use crate::run::RunOptions;
@@ -41,7 +44,8 @@ pub trait Attractor: Sync {
 pub struct Attraction {
     /// C of the cosine γ.
     pub cut_off: CutOff,
-    /// Distance from the target, in voxels, within which all that does not face away is drawn. 0 for the limits alone.
+    /// Distance from the target, in voxels, within which all that does not face away is drawn, and in the nearest part of it everything. 0 for
+    /// the limits alone.
     pub tip: f64,
     /// Away from the target instead of towards it.
     pub repel: bool,
@@ -53,7 +57,7 @@ impl Attraction {
     /// The cosines of the paper (table 4, teapot embossing) between which C rises.
     pub const LIMITS: [f64; 2] = [0.8, 0.9];
     /// The least distance, rounded up, with which a single point is reached.
-    pub const TIP: f64 = 3.0;
+    pub const TIP: f64 = 5.0;
 }
 
 impl Default for Attraction {
@@ -87,7 +91,7 @@ const LONGEST_TIMED: f64 = 0.1;
 const LONGEST_STEP: f64 = 0.5;
 
 /// Largest way in a step, in voxels, of what travels along the surface.
-const TRAVEL: f64 = 0.8;
+const TRAVEL: f64 = 2.0;
 
 /// Half the interval of cosines over which C′ is measured.
 const SLOPE_STEP: f64 = 0.02;
@@ -95,13 +99,16 @@ const SLOPE_STEP: f64 = 0.02;
 /// The cosine from which on a surface within the tip is drawn fully.
 const SIDEWAYS: f64 = 0.2;
 
+/// Part of the tip within which all of a surface is drawn.
+const BESIDE: f64 = 0.4;
+
 /// Voxels with less of the pull do not tell whether all that draws is reached: the rim of a region would never be.
 const DRAWN: f32 = 0.5;
 
 /// Steps without progress after which a flow is at rest.
-const PATIENCE: u32 = 30;
+const PATIENCE: u32 = 40;
 
-/// What counts as progress, in voxels: a change of the mean distance of what is drawn from its targets.
+/// What counts as progress, in voxels: a fall of the mean distance of what is drawn from its targets.
 const PROGRESS: f64 = 0.01;
 
 /// Voxels around what is drawn and what draws it that may change as well.
@@ -110,7 +117,8 @@ const MARGIN: f64 = 6.0;
 /// Draws a level set to `target`, where `region` lets it, until every point that draws is reached (within [`REACHED`]), nothing comes nearer,
 /// or `until`. The time unit is that in which a gap falls to 1/e.
 ///
-/// Only a box around what is drawn at the start and what draws it is touched: outside of it voxels keep their bits.
+/// Only a box around what is drawn at the start and what draws it is touched, and in it only leaves that are drawn or beside such leaves: all
+/// other voxels keep their bits.
 pub fn attract(
     level_set: &mut LevelSet,
     target: &dyn Attractor,
@@ -120,12 +128,15 @@ pub fn attract(
     solver: &SolverOptions,
     run: &RunOptions,
 ) -> Result<AttractionReport> {
-    let Some(bounds) = drawn_bounds(level_set, target, how, region, run)? else {
+    let Some((bounds, drawn)) = drawn_bounds(level_set, target, how, region, run)? else {
         let voxels = level_set.grid().active_voxels();
         let flow = Report { steps: 0, time: 0.0, voxels, stopped: StopReason::AtRest };
         return Ok(AttractionReport { flow, gap: 0.0, stalled: false });
     };
-    let within = Within { bounds, region };
+    let grid = level_set.grid();
+    let near: FxHashSet<IVec3> = drawn.iter().flat_map(|&origin| around(origin)).collect();
+    let idle = grid.leaves().iter().map(|&id| grid.origin(id)).filter(|origin| !near.contains(origin)).collect();
+    let within = Within { bounds, region, idle, transform: *level_set.transform() };
     // Depths are measured in the field as it was.
     let original = match how.max_depth {
         Some(depth) => {
@@ -148,16 +159,30 @@ pub fn attract(
     Ok(AttractionReport { flow, gap: motion.gap, stalled: motion.patience == 0 })
 }
 
-/// A box in world space, and a region.
+/// What may move: a box in world space, less the leaves that had a surface at the start which nothing draws, and a region.
 struct Within<'a> {
     bounds: (DVec3, DVec3),
     region: Option<&'a dyn Region>,
+    /// Origins of leaves.
+    idle: FxHashSet<IVec3>,
+    transform: Transform,
+}
+
+impl Within<'_> {
+    fn is_idle(&self, xyz: DVec3) -> bool {
+        self.idle.contains(&leaf_origin(self.transform.world_to_index(xyz).round().as_ivec3()))
+    }
+}
+
+/// The origins of a leaf and of the 26 around it.
+fn around(origin: IVec3) -> impl Iterator<Item = IVec3> {
+    (0..27).map(move |n| origin + IVec3::new(n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1) * LEAF_DIM)
 }
 
 impl Region for Within<'_> {
     fn weight(&self, xyz: DVec3) -> f32 {
         let (lo, hi) = self.bounds;
-        match xyz.cmpge(lo).all() && xyz.cmple(hi).all() {
+        match xyz.cmpge(lo).all() && xyz.cmple(hi).all() && !self.is_idle(xyz) {
             true => self.region.map_or(1.0, |region| region.weight(xyz)),
             false => 0.0,
         }
@@ -175,6 +200,10 @@ impl Region for Within<'_> {
             return [0.0; 2];
         }
         let [low, high] = self.region.map_or([1.0; 2], |region| region.weights_within(centre, radius));
+        // It is asked for leaves, by their middle.
+        if self.is_idle(centre) {
+            return [0.0; 2];
+        }
         let all = (centre - radius).cmpge(lo).all() && (centre + radius).cmple(hi).all();
         [if all { low } else { 0.0 }, high]
     }
@@ -218,9 +247,10 @@ impl Pull<'_> {
             normal = sampler.smooth_gradient(from).try_normalize()?;
         }
         let cosine = if distance > 1e-6 { normal.dot(to) / distance * phi.signum() } else { 1.0 };
-        let near =
-            if distance < self.how.tip { 1.0 - ramp_between(distance, self.how.tip / 2.0, self.how.tip) } else { 0.0 };
-        let share_at = |cosine: f64| self.how.cut_off.weight(cosine).max(near * ramp_between(cosine, 0.0, SIDEWAYS));
+        let within = |reach: f64| if reach > 0.0 { 1.0 - ramp_between(distance, reach / 2.0, reach) } else { 0.0 };
+        let (near, beside) = (within(self.how.tip), within(self.how.tip * BESIDE));
+        let share_at =
+            |cosine: f64| self.how.cut_off.weight(cosine).max(near * ramp_between(cosine, 0.0, SIDEWAYS)).max(beside);
         let mut share = share_at(cosine);
         let slope = (share_at(cosine + SLOPE_STEP) - share_at(cosine - SLOPE_STEP)).abs() / (2.0 * SLOPE_STEP);
         let transport = slope * phi.abs() * (1.0 - cosine * cosine).max(0.0).sqrt();
@@ -260,14 +290,17 @@ fn foot(sampler: &mut Sampler, voxel_size: f64, ijk: IVec3) -> Option<(DVec3, DV
     Some((foot, gradient / squared.sqrt()))
 }
 
-/// World-space box around what is drawn and what draws it, with a margin; `None` if nothing is drawn.
+/// A world-space box and the origins of leaves.
+type Drawn = ((DVec3, DVec3), Vec<IVec3>);
+
+/// World-space box around what is drawn and what draws it, with a margin, and the leaves that are drawn; `None` if nothing is.
 fn drawn_bounds(
     level_set: &LevelSet,
     target: &dyn Attractor,
     how: &Attraction,
     region: Option<&dyn Region>,
     run: &RunOptions,
-) -> Result<Option<(DVec3, DVec3)>> {
+) -> Result<Option<Drawn>> {
     let (grid, transform, voxel_size) = (level_set.grid(), level_set.transform(), level_set.voxel_size());
     // At the start nothing has been pushed: no depth counts yet.
     let how = Attraction { max_depth: None, ..*how };
@@ -297,17 +330,18 @@ fn drawn_bounds(
                 bounds = Some(bounds.map_or((a, b), |(lo, hi)| (lo.min(a), hi.max(b))));
             }
         }
-        bounds
+        bounds.map(|bounds| (bounds, origin))
     });
     run.check("attraction")?;
-    let bounds = boxes.into_iter().flatten().reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
+    let leaves: Vec<IVec3> = boxes.iter().flatten().map(|(_, origin)| *origin).collect();
+    let bounds = boxes.into_iter().flatten().map(|(bounds, _)| bounds).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
     let margin = f64::from(level_set.half_width()) + MARGIN;
     Ok(bounds.map(|(lo, hi)| {
         let corners = (0..8).map(|c| {
             let pick = |bit: i32, axis: usize| if c & bit == 0 { lo[axis] - margin } else { hi[axis] + margin };
             transform.index_to_world(DVec3::new(pick(4, 0), pick(2, 1), pick(1, 2)))
         });
-        corners.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), c| (lo.min(c), hi.max(c)))
+        (corners.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), c| (lo.min(c), hi.max(c))), leaves)
     }))
 }
 
@@ -379,9 +413,8 @@ impl Drawing<'_> {
     fn wake(&mut self, grid: &Grid) {
         let mut awake = LeafSet::default();
         for &origin in &self.drawn {
-            for n in 0..27 {
-                let step = IVec3::new(n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1) * LEAF_DIM;
-                let id = grid.find(origin + step);
+            for beside in around(origin) {
+                let id = grid.find(beside);
                 if !id.is_sentinel() {
                     awake.insert(id);
                 }
@@ -412,7 +445,7 @@ impl Motion for Drawing<'_> {
         if fastest == 0.0 || (!endless && self.gap < REACHED) {
             return None;
         }
-        if (mean - self.mean).abs() > PROGRESS {
+        if mean < self.mean - PROGRESS {
             (self.mean, self.patience) = (mean, PATIENCE);
         }
         if !endless {
@@ -467,8 +500,11 @@ mod tests {
         points((0..169).map(|i| DVec3::new(f64::from(i / 13 - 6), f64::from(i % 13 - 6), z)))
     }
 
-    const SOLVER: SolverOptions =
-        SolverOptions { scheme: UpwindScheme::HjWeno5, normalizations: 3, ..SolverOptions::FIRST_ORDER };
+    const SOLVER: SolverOptions = SolverOptions {
+        scheme: UpwindScheme::HjWeno5,
+        integrator: TimeIntegrator::TvdRk3,
+        ..SolverOptions::FIRST_ORDER
+    };
 
     /// The limits of the paper alone.
     fn paper() -> Attraction {

@@ -96,6 +96,10 @@ impl SpeedFunction for CurvatureFlow {
         voxel_size * voxel_size / weight
     }
 
+    fn needs_hold(&self) -> bool {
+        true
+    }
+
     #[inline(always)]
     fn rate<S: Simd>(&self, simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
         let (k, gamma) = self.curvature.of(simd, &curvatures(simd, halo, x, y, voxel_size), voxel_size);
@@ -112,6 +116,10 @@ impl SpeedFunction for ToRest {
 
     fn largest_step(&self, voxel_size: f64) -> f64 {
         self.0.largest_step(voxel_size)
+    }
+
+    fn needs_hold(&self) -> bool {
+        true
     }
 
     #[inline(always)]

@@ -110,9 +110,10 @@ pub fn evolve(
     run: &RunOptions,
 ) -> Result<Report> {
     let voxel_size = level_set.voxel_size();
-    let rest = matches!(until, Until::Rest(_)).then(|| Rest { start: level_set.grid().clone(), reached: false });
+    let start = region.filter(|_| function.needs_hold()).map(|_| level_set.grid().clone());
+    let rest = matches!(until, Until::Rest(_)).then_some(false);
     let mut tracker = Tracker::new(level_set, region, *solver, run);
-    drive(&mut tracker, &mut Flow { function, voxel_size, rest }, until)
+    drive(&mut tracker, &mut Flow { function, voxel_size, start, rest }, until)
 }
 
 /// Part of a step by which a time may exceed a whole number of steps without one more.
@@ -122,20 +123,15 @@ pub(super) const WHOLE_STEPS: f64 = 1e-9;
 struct Flow<'a, F> {
     function: &'a F,
     voxel_size: f64,
-    /// If it goes on until it rests.
-    rest: Option<Rest>,
-}
-
-/// The state of a flow that goes on until it rests.
-struct Rest {
-    /// The field before.
-    start: Grid,
-    reached: bool,
+    /// The field before, if the flow is held at the rim of its region.
+    start: Option<Grid>,
+    /// Whether it has come to rest, if it goes on until then.
+    rest: Option<bool>,
 }
 
 impl<F: SpeedFunction> Motion for Flow<'_, F> {
     fn prepare(&mut self, _: &Tracker, left: f64) -> Option<f64> {
-        if self.rest.as_ref().is_some_and(|rest| rest.reached) {
+        if self.rest == Some(true) {
             return None;
         }
         let largest = self.function.largest_step(self.voxel_size);
@@ -150,9 +146,11 @@ impl<F: SpeedFunction> Motion for Flow<'_, F> {
         let step = FlowStep { function: self.function, dt: dt as f32, voxel_size: self.voxel_size as f32 };
         // Flows of curvature are first order in time: dt is bounded by stability, not by accuracy.
         tracker.integrate(&step, TimeIntegrator::TvdRk1, Target::Moving)?;
+        if let Some(start) = &self.start {
+            tracker.hold(start);
+        }
         if let Some(rest) = &mut self.rest {
-            tracker.hold(&rest.start);
-            rest.reached = tracker.last_change().is_rest(dt, self.voxel_size);
+            *rest = tracker.last_change().is_rest(dt, self.voxel_size);
         }
         Ok(())
     }

@@ -1,11 +1,12 @@
-//! Flows that go on until they rest: how far a step moved the surface, and what holds them at the rim of a region.
+//! What long flows in a region need: whether a step still moved the surface, and what holds it at the region's rim.
 //!
-//! A region's weight α slows a flow down. One that goes on until it rests has all the time it needs, and ends up as far from where it
-//! was at α = 0.01 as at α = 1: a cliff at the rim, where the voxels with α = 0 stay as they were. So such a flow is held:
+//! A region's weight α slows a flow down. One that goes on long enough ends up as far from where it was at α = 0.01 as at α = 1, and
+//! one-sided flows pile material up against the voxels with α = 0, which stay as they were: a cliff, and no distance. So such
+//! a flow is held,
 //!
-//! > |φ − φ₀| ≤ 2 · background · α/(1 − α),
+//! > |φ − φ₀| ≤ h α/(1 − α),
 //!
-//! which is no bound from α = ½ on and lets nothing move where α vanishes.
+//! a voxel at α = ½, and no bound in effect from α = 0.9 on.
 
 use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 use rayon::prelude::*;
@@ -20,6 +21,9 @@ const SLOWEST: f64 = 1e-3;
 /// The root mean square change of a step, in voxels, that is rest, over the voxels that change at all: however large the
 /// region, a part of it that still moves is not lost in the mean.
 const SMALLEST: f64 = 1e-4;
+
+/// The weight from which on nothing is held: the bound is nine voxels there, more than twice the half width of common bands.
+const FREE: f32 = 0.9;
 
 /// What a step changed at the surface: the voxels that are less than one away from it.
 #[derive(Clone, Copy, Debug, Default)]
@@ -61,18 +65,18 @@ impl Tracker<'_> {
         let mut rim = LeafSet::default();
         for id in self.domain.leaves().iter() {
             let (alpha, moving) = (&weights.alpha(id).0, self.domain.moving(id, grid.mask(id)));
-            if moving.iter().any(|at| alpha[at] < 0.5) {
+            if moving.iter().any(|at| alpha[at] < FREE) {
                 place[id.index()] = Some(start.find(grid.origin(id)));
                 rim.insert(id);
             }
         }
-        let (domain, most) = (&self.domain, 2.0 * grid.background());
+        let (domain, voxel_size) = (&self.domain, self.transform.voxel_size() as f32);
         self.grid.update(&rim, |id, values, mask| {
             let Some(before) = place[id.index()] else { return };
             let (before, alpha) = (&start.values(before).0, &weights.alpha(id).0);
-            for at in domain.moving(id, *mask).iter().filter(|&at| alpha[at] < 0.5) {
-                let reach = most * alpha[at] / (1.0 - alpha[at]);
-                values.0[at] = values.0[at].clamp(before[at] - reach, before[at] + reach);
+            for at in domain.moving(id, *mask).iter().filter(|&at| alpha[at] < FREE) {
+                let reach = voxel_size * alpha[at] / (1.0 - alpha[at]);
+                values.0[at] = values.0[at].max(before[at] - reach).min(before[at] + reach);
             }
         });
     }

@@ -18,6 +18,11 @@ pub trait SpeedFunction: Sync {
     /// The largest stable time step for a voxel size (world units).
     fn largest_step(&self, voxel_size: f64) -> f64;
 
+    /// Whether it may pile material up at the rim of a region, and has to be held there: flows that are cut off or one-sided.
+    fn needs_hold(&self) -> bool {
+        false
+    }
+
     /// F|∇φ| at rows (x, y) and (x, y + 1) of the leaf in `halo`. Must be `#[inline(always)]`.
     fn rate<S: Simd>(&self, simd: S, halo: &Self::Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S>;
 }

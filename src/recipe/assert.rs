@@ -64,7 +64,7 @@ impl Assertions {
         }
         for (name, range) in read.ranges() {
             if let Some([least, largest]) = range
-                && !(least <= largest)
+                && (least.is_nan() || largest.is_nan() || least > largest)
             {
                 let accepted = "the least value first";
                 return Err(EditError::parameter("assert", name, format!("[{least}, {largest}]"), accepted));

@@ -118,7 +118,7 @@ impl Stamp {
         let operation = if raised { CsgOperation::Union } else { CsgOperation::Difference };
         let mut result = csg(level_set, &[&tool], operation, run)?;
         if let Some(region) = region {
-            result = crate::ops::keep::kept(result, level_set, region, run)?;
+            result = crate::ops::confine::kept(level_set, result, region);
         }
         Ok(result)
     }
