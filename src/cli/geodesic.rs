@@ -121,7 +121,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
 }
 
 /// The field without the voxels whose value is infinite.
-fn reached(field: &Field) -> Field {
+pub(super) fn reached(field: &Field) -> Field {
     let mut grid = field.grid().clone();
     grid.update_all(|_, values, mask| {
         for at in mask.iter().filter(|&at| !values.0[at].is_finite()).collect::<Vec<_>>() {

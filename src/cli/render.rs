@@ -9,11 +9,13 @@ use glam::DVec3;
 use serde_json::{Map, json};
 
 use super::context::Context;
+use super::geodesic::reached;
 use super::{Verb, args, files};
 use crate::atomic::write_atomically;
 use crate::error::{EditError, Result};
 use crate::files::{frames, input, output};
 use crate::levelset::LevelSet;
+use crate::ops::Vector;
 use crate::region::{Region, RegionPlan};
 use crate::render::{CameraSpec, ColorBy, Frame, Image, RenderOptions, UpAxis, render};
 
@@ -28,6 +30,7 @@ enum Color {
     Normal,
     Region,
     Component,
+    Geodesic,
     Difference(PathBuf),
 }
 
@@ -40,7 +43,15 @@ fn build(command: Command) -> Command {
         .arg(
             option("color-by", "WHAT")
                 .value_parser(ValueParser::new(color))
-                .help("clay, curvature, normal, component, region (with --region) or difference:OTHER [default: clay]"),
+                .help("clay, curvature, normal, component, geodesic (with --from), region (with --region) or difference:OTHER [default: clay]"),
+        )
+        .arg(
+            option("from", "X,Y,Z")
+                .num_args(1..)
+                .action(ArgAction::Append)
+                .allow_hyphen_values(true)
+                .value_parser(ValueParser::new(|text: &str| text.parse::<Vector>()))
+                .help("The points on the surface from which --color-by geodesic measures"),
         )
         .arg(
             option("region", "SPEC")
@@ -68,7 +79,7 @@ fn build(command: Command) -> Command {
         )
         .arg(
             option("range", "NUMBER").value_parser(value_parser!(f64)).help(
-                "Where colours saturate: curvature in 1/voxel [default: 0.125], difference in voxels [default: 1]",
+                "Where colours saturate: curvature in 1/voxel [default: 0.125], difference in voxels [default: 1], geodesic in world units [default: the farthest]",
             ),
         )
         .arg(
@@ -90,9 +101,12 @@ fn color(text: &str) -> Result<Color, String> {
         "normal" => Color::Normal,
         "region" => Color::Region,
         "component" => Color::Component,
+        "geodesic" => Color::Geodesic,
         _ => match text.strip_prefix("difference:") {
             Some(other) if !other.is_empty() => Color::Difference(other.into()),
-            _ => return Err("there are clay, curvature, normal, component, region and difference:OTHER".into()),
+            _ => {
+                return Err("there are clay, curvature, normal, component, geodesic, region and difference:OTHER".into());
+            }
         },
     })
 }
@@ -128,6 +142,11 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         let accepted = "`--color-by region` and one or more `--region SPEC` go together";
         return Err(EditError::parameter("render", "color_by", format!("{color:?}").to_lowercase(), accepted));
     }
+    let from: Vec<DVec3> = matches.get_many::<Vector>("from").into_iter().flatten().map(|v| v.0).collect();
+    if (color == Color::Geodesic) == from.is_empty() {
+        let accepted = "`--color-by geodesic` and one or more points `--from X,Y,Z` go together";
+        return Err(EditError::parameter("render", "color_by", format!("{color:?}").to_lowercase(), accepted));
+    }
     let frames = frames(&path, matches.get_one::<u32>("turntable").copied());
     if args::flag(matches, "dry-run") {
         let mut all = paths;
@@ -148,9 +167,14 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         Color::Component => Some(input.level_set.components(&context.run)?),
         _ => None,
     };
+    let distances = match color {
+        Color::Geodesic => Some(reached(&input.level_set.geodesic(&from, &context.run)?.field)),
+        _ => None,
+    };
     let label = |xyz: DVec3| components.as_ref()?.nearest(input.level_set.transform().world_to_index(xyz));
-    let color_by = match color {
-        Color::Component => ColorBy::Label(&label),
+    let color_by = match (&color, &distances) {
+        (Color::Component, _) => ColorBy::Label(&label),
+        (Color::Geodesic, Some(field)) => ColorBy::Geodesic(field),
         _ => color.of(inputs.get(1).map(|input| &input.level_set), region.as_deref()),
     };
     for (path, turn) in &frames {
@@ -257,6 +281,7 @@ mod tests {
         assert_eq!(camera("1,2,3").map(|c| c.field_of_view), Ok(3.0));
         assert!(camera("1").is_err() && camera("a,b").is_err());
         assert_eq!(color("difference:a.vdb"), Ok(Color::Difference("a.vdb".into())));
+        assert_eq!(color("geodesic"), Ok(Color::Geodesic));
         assert!(color("difference:").is_err() && color("colour").is_err());
     }
 

@@ -58,6 +58,8 @@ pub enum ColorBy<'a> {
     /// Signed distance to another surface, in its voxels: red outside of it, blue inside, white where both agree.
     /// Beyond the other's band the colour is that of its rim.
     Difference(&'a LevelSet),
+    /// Distance along the surface (world units), as of [`LevelSet::geodesic`]: dark blue 0 to yellow, clay where there is none.
+    Geodesic(&'a crate::levelset::Field),
     /// Weight of a region: grey 0, orange 1.
     Region(&'a dyn Region),
     /// A colour for each number that the function gives a world position near the surface, as of connected components; clay for `None`.
@@ -80,7 +82,8 @@ pub struct RenderOptions {
     pub occlusion_rays: u32,
     /// Whether the surface throws shadows on itself.
     pub shadow: bool,
-    /// Value at which the diverging colours are saturated: curvature in 1/voxel (0.125 where not given), difference in voxels (1).
+    /// Value at which the diverging colours are saturated: curvature in 1/voxel (0.125 where not given), difference in voxels (1),
+    /// distance along the surface in world units (the farthest).
     pub range: Option<f64>,
     /// Leaves the background transparent.
     pub transparent_background: bool,
@@ -182,7 +185,11 @@ pub fn render(
         sky_rays: options.occlusion_rays as usize,
         key_rays: if options.shadow { SHADOW_RAYS } else { 0 },
     };
-    let default_range = if matches!(color_by, ColorBy::Difference(_)) { DIFFERENCE_RANGE } else { CURVATURE_RANGE };
+    let default_range = match color_by {
+        ColorBy::Difference(_) => DIFFERENCE_RANGE,
+        ColorBy::Geodesic(field) => field.range().map_or(1.0, |(_, most)| f64::from(most).max(f64::MIN_POSITIVE)),
+        _ => CURVATURE_RANGE,
+    };
     let picture = Picture {
         scene: skip.map(|skip| Scene { field: Field::new(level_set.grid(), level_set.voxel_size()), skip }),
         camera,

@@ -10,8 +10,9 @@ use super::field::Cursor;
 use super::march::{Ray, Scene, Start};
 use super::occlusion::{self, FilterPoint, Light, REACH, Visibility, filter_weight};
 use super::shade::{self, Lights};
+use super::vertices::sequential;
 use super::{ColorBy, DataRange};
-use crate::grid::Transform;
+use crate::grid::{Accessor, Transform};
 use crate::levelset::Sampler;
 
 /// Edge of a tile in pixels. The rim costs an eighth more work.
@@ -57,6 +58,7 @@ struct Hit {
 struct Readers<'a> {
     cursor: Cursor<'a>,
     other: Option<(Sampler<'a>, &'a Transform, f64)>,
+    distances: Option<(Accessor<'a>, &'a Transform)>,
 }
 
 /// Pixels of a tile with its rim.
@@ -100,6 +102,10 @@ impl Picture<'_> {
             cursor: scene.field.cursor(),
             other: match self.color_by {
                 ColorBy::Difference(other) => Some((other.sampler(), other.transform(), other.voxel_size())),
+                _ => None,
+            },
+            distances: match self.color_by {
+                ColorBy::Geodesic(field) => Some((field.accessor(), field.transform())),
                 _ => None,
             },
         };
@@ -156,6 +162,12 @@ impl Picture<'_> {
                 let phi = f64::from(sampler.trilinear(transform.world_to_index(xyz())));
                 shade::diverging(phi / *voxel / self.range.0)
             }),
+            ColorBy::Geodesic(_) => {
+                let distance = readers.distances.as_mut().and_then(|(accessor, transform)| {
+                    crate::levelset::Field::trilinear(accessor, transform.world_to_index(xyz()))
+                });
+                distance.map_or(shade::CLAY, |distance| sequential(f64::from(distance) / self.range.0))
+            }
             ColorBy::Region(region) => REGION_OFF.lerp(REGION_ON, f64::from(region.weight(xyz())).clamp(0.0, 1.0)),
             ColorBy::Label(label) => label(xyz()).map_or(shade::CLAY, shade::label),
         };

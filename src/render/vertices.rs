@@ -38,7 +38,7 @@ const STOPS: [[f64; 3]; 5] =
     [[0.267, 0.005, 0.329], [0.230, 0.322, 0.546], [0.128, 0.567, 0.551], [0.369, 0.789, 0.383], [0.993, 0.906, 0.144]];
 
 /// The linear colour of a number in 0..1.
-fn sequential(value: f64) -> DVec3 {
+pub(super) fn sequential(value: f64) -> DVec3 {
     let at = value.clamp(0.0, 1.0) * (STOPS.len() - 1) as f64;
     let stop = (at as usize).min(STOPS.len() - 2);
     let srgb = DVec3::from(STOPS[stop]).lerp(DVec3::from(STOPS[stop + 1]), at - stop as f64);
