@@ -62,7 +62,6 @@ impl<K: Stencil> Work for All<'_, K> {
 
 fn bench<K: Stencil>(bencher: Bencher, isa: Isa) {
     let level_set = sphere();
-    level_set.grid().neighbours();
     if choose(isa) != isa {
         // This machine does not have it: nothing is reported under its name.
         return;

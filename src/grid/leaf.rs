@@ -85,6 +85,18 @@ impl LeafMask {
         (self.0[x] >> (y * 8)) as u8
     }
 
+    /// Calls `f` with x and y of every pair of rows (x, y), (x, y + 1) that has no active voxel; y is even.
+    #[inline(always)]
+    pub fn for_each_empty_pair(&self, mut f: impl FnMut(usize, usize)) {
+        for (x, &word) in self.0.iter().enumerate() {
+            for pair in 0..4 {
+                if (word >> (16 * pair)) as u16 == 0 {
+                    f(x, 2 * pair);
+                }
+            }
+        }
+    }
+
     /// Calls `f` with x, y and the 16 bits of every pair of rows (x, y), (x, y + 1) that has an active voxel; y is even.
     #[inline(always)]
     pub fn for_each_pair(&self, mut f: impl FnMut(usize, usize, u16)) {

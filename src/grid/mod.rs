@@ -28,9 +28,9 @@ pub use combine::{Combination, SignRule};
 pub use leaf::{Face, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset, leaf_origin, offset_to_local};
 pub use leaf_set::LeafSet;
 pub use paged::{LeafId, PAGE_LEAVES, PageLeaves, Paged};
-pub(crate) use prefetch::prefetch_faces;
+pub(crate) use prefetch::Ahead;
 use topology::Topology;
-pub use topology::{Neighbours, neighbour_index};
+pub use topology::{NeighbourTable, Neighbours, neighbour_index};
 pub use transform::{Transform, VOXEL_SIZES};
 pub use volume::{VectorVolume, Volume};
 
@@ -102,6 +102,16 @@ impl Grid {
         self.topology.order()
     }
 
+    /// The place of each leaf in [`leaves`](Self::leaves), by slot ([`LeafId::index`]).
+    pub(crate) fn places(&self) -> Vec<u32> {
+        self.topology.places()
+    }
+
+    /// Slots in all, those without a leaf included: the length of a list by [`LeafId::index`].
+    pub(crate) fn slot_count(&self) -> usize {
+        self.topology.slot_count()
+    }
+
     /// All leaves as a set.
     pub fn leaf_set(&self) -> &LeafSet {
         self.topology.live()
@@ -129,8 +139,8 @@ impl Grid {
         self.topology.find(origin)
     }
 
-    /// The 27 leaves around and including each leaf, by slot ([`LeafId::index`]). Computed once a topology.
-    pub fn neighbours(&self) -> &[Neighbours] {
+    /// The 27 leaves around and including each leaf, by slot ([`LeafId::index`]).
+    pub fn neighbours(&self) -> NeighbourTable<'_> {
         self.topology.neighbours()
     }
 

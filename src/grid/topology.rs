@@ -13,7 +13,7 @@ use rustc_hash::FxHashMap;
 use super::combine::SignRule;
 use super::leaf::LEAF_DIM;
 use super::leaf_set::LeafSet;
-use super::paged::{LeafId, PAGE_LEAVES};
+use super::paged::{LeafId, PAGE_LEAVES, PageLeaves};
 
 /// Leaves along the edge of a node.
 const NODE_LEAVES: i32 = 16;
@@ -28,6 +28,25 @@ type NodeTable = [LeafId; NODE_ENTRIES];
 /// A leaf and its 26 neighbours: entry `(dx+1)·9 + (dy+1)·3 + (dz+1)`; 13 is the leaf itself.
 pub type Neighbours = [LeafId; 27];
 
+/// The [`Neighbours`] of every leaf, by slot ([`LeafId::index`]). They are looked up a page at a time, when one of its leaves is asked
+/// for, and kept up to date from then on: work on a few leaves does not pay for the others.
+#[derive(Clone, Copy)]
+pub struct NeighbourTable<'a>(&'a Topology);
+
+impl std::ops::Index<usize> for NeighbourTable<'_> {
+    type Output = Neighbours;
+
+    #[inline(always)]
+    fn index(&self, slot: usize) -> &Neighbours {
+        let page = slot / PAGE_LEAVES;
+        let neighbours = self.0.neighbours[page].get_or_init(|| self.0.neighbours_of_page(page));
+        &neighbours[slot % PAGE_LEAVES]
+    }
+}
+
+/// The neighbours of the leaves of one page.
+type NeighbourPage = [Neighbours; PAGE_LEAVES];
+
 #[derive(Clone, Default)]
 pub(super) struct Topology {
     nodes: FxHashMap<IVec3, Arc<NodeTable>>,
@@ -38,12 +57,24 @@ pub(super) struct Topology {
     live: LeafSet,
     /// Slots of removed leaves, the next one to use last.
     free: Vec<LeafId>,
-    neighbours: OnceLock<Vec<Neighbours>>,
+    /// By page, once they have been asked for.
+    neighbours: Vec<OnceLock<Arc<NeighbourPage>>>,
 }
 
 /// Sort key of origins: x, then y, then z.
 pub(super) fn key(origin: IVec3) -> (i32, i32, i32) {
     (origin.x, origin.y, origin.z)
+}
+
+/// Sort key of slots: node by node, along a Z-order curve in each.
+fn block_key(origin: IVec3) -> ((i32, i32, i32), u32) {
+    // Bits 0 to 3 to places 0, 3, 6, 9.
+    let spread = |v: i32| {
+        let v = (v & (NODE_LEAVES - 1)) as u32;
+        v & 1 | (v & 2) << 2 | (v & 4) << 4 | (v & 8) << 6
+    };
+    let leaf: IVec3 = origin >> 3;
+    (key(node_of(origin)), spread(leaf.x) << 2 | spread(leaf.y) << 1 | spread(leaf.z))
 }
 
 fn node_of(origin: IVec3) -> IVec3 {
@@ -64,13 +95,19 @@ impl Topology {
     /// Leaves at `origins`, which must be sorted by (x, y, z), without duplicates and multiples of 8. All space between is outside.
     pub fn from_origins(origins: &[IVec3]) -> Self {
         debug_assert!(origins.is_sorted_by(|a, b| key(*a) < key(*b)));
+        let mut slots: Vec<(u32, IVec3)> = (0..).zip(origins.iter().copied()).collect();
+        slots.par_sort_unstable_by_key(|(_, origin)| block_key(*origin));
         let mut topology = Self { origins: vec![IVec3::ZERO; PAGE_LEAVES], ..Self::default() };
-        topology.origins.extend_from_slice(origins);
-        topology.order = (0..origins.len()).map(|i| LeafId::new(PAGE_LEAVES + i)).collect();
+        topology.origins.extend(slots.iter().map(|(_, origin)| *origin));
+        topology.order = vec![LeafId::OUTSIDE; origins.len()];
+        for (slot, (place, _)) in (PAGE_LEAVES..).zip(slots) {
+            topology.order[place as usize] = LeafId::new(slot);
+        }
         topology.live = topology.order.iter().copied().collect();
         for (&origin, &id) in origins.iter().zip(&topology.order) {
             set_entry(&mut topology.nodes, origin, id);
         }
+        topology.forget_neighbours();
         topology
     }
 
@@ -102,12 +139,22 @@ impl Topology {
         topology.free = (PAGE_LEAVES..slots).rev().map(LeafId::new).filter(|id| !topology.live.contains(*id)).collect();
         let known = nodes.into_iter().zip(tables).filter(|(_, table)| table.iter().any(|e| *e != LeafId::OUTSIDE));
         topology.nodes = known.collect();
+        topology.forget_neighbours();
         topology
     }
 
     /// The leaves in the order of their origins.
     pub fn order(&self) -> &[LeafId] {
         &self.order
+    }
+
+    /// The place of each leaf in the order of origins, by slot.
+    pub fn places(&self) -> Vec<u32> {
+        let mut places = vec![u32::MAX; self.origins.len()];
+        for (place, id) in (0..).zip(&self.order) {
+            places[id.index()] = place;
+        }
+        places
     }
 
     pub fn live(&self) -> &LeafSet {
@@ -118,9 +165,14 @@ impl Topology {
         self.origins[id.index()]
     }
 
+    /// Slots of sentinels, leaves and free ones.
+    pub fn slot_count(&self) -> usize {
+        self.origins.len()
+    }
+
     /// Pages that the slots need.
     pub fn page_count(&self) -> usize {
-        self.origins.len().div_ceil(PAGE_LEAVES)
+        self.slot_count().div_ceil(PAGE_LEAVES)
     }
 
     /// The leaf at `origin`, or the sentinel of the sign there.
@@ -137,6 +189,7 @@ impl Topology {
     /// Copies the tables that are shared with other topologies.
     pub fn unshare(&mut self) {
         self.nodes.values_mut().for_each(|table| _ = Arc::make_mut(table));
+        self.neighbours.iter_mut().filter_map(OnceLock::get_mut).for_each(|page| _ = Arc::make_mut(page));
     }
 
     /// Adds leaves at `origins` (sorted, no leaf there yet); returns them with the sentinel that they replace.
@@ -152,16 +205,17 @@ impl Topology {
             added.push((id, set_entry(&mut self.nodes, origin, id)));
         }
         self.merge_order(&added);
-        if let Some(mut table) = self.neighbours.take() {
-            table.resize(self.origins.len(), [LeafId::OUTSIDE; 27]);
-            let mut cache = NodeCache::default();
-            for &(id, _) in &added {
-                let around = self.neighbours_of(id, &mut cache);
-                table[id.index()] = around;
-                relink(&mut table, &around, |_| id);
+        let mut table = std::mem::take(&mut self.neighbours);
+        table.resize_with(self.page_count(), OnceLock::new);
+        let mut cache = NodeCache::default();
+        for &(id, _) in &added {
+            let around = self.neighbours_of(id, &mut cache);
+            if let Some(page) = table[id.page()].get_mut() {
+                Arc::make_mut(page)[id.slot()] = around;
             }
-            self.neighbours = OnceLock::from(table);
+            relink(&mut table, &around, id);
         }
+        self.neighbours = table;
         added
     }
 
@@ -176,12 +230,13 @@ impl Topology {
             self.free.push(id);
         }
         self.order.retain(|id| self.live.contains(*id));
-        if let Some(table) = self.neighbours.get_mut() {
-            for &(id, sentinel) in removed {
-                let around = table[id.index()];
-                relink(table, &around, |_| sentinel);
-            }
+        let mut table = std::mem::take(&mut self.neighbours);
+        let mut cache = NodeCache::default();
+        for &(id, sentinel) in removed {
+            let around = self.neighbours_of(id, &mut cache);
+            relink(&mut table, &around, sentinel);
         }
+        self.neighbours = table;
     }
 
     fn merge_order(&mut self, added: &[(LeafId, LeafId)]) {
@@ -198,27 +253,43 @@ impl Topology {
         self.order = order;
     }
 
-    /// The neighbours of every leaf by slot, computed at the first call and kept up to date from then on.
-    pub fn neighbours(&self) -> &[Neighbours] {
-        self.neighbours.get_or_init(|| {
-            let mut table = vec![[LeafId::OUTSIDE; 27]; self.origins.len()];
-            table.par_chunks_mut(PAGE_LEAVES).enumerate().for_each(|(page, chunk)| {
-                let mut cache = NodeCache::default();
-                for (slot, around) in chunk.iter_mut().enumerate() {
-                    let id = LeafId::new(page * PAGE_LEAVES + slot);
-                    if self.live.contains(id) {
-                        *around = self.neighbours_of(id, &mut cache);
-                    }
-                }
-            });
-            table
-        })
+    /// The neighbours of every leaf.
+    pub fn neighbours(&self) -> NeighbourTable<'_> {
+        NeighbourTable(self)
+    }
+
+    /// For when signs have changed: neighbours are looked up anew.
+    fn forget_neighbours(&mut self) {
+        self.neighbours.clear();
+        self.neighbours.resize_with(self.page_count(), OnceLock::new);
+    }
+
+    fn neighbours_of_page(&self, page: usize) -> Arc<NeighbourPage> {
+        let mut cache = NodeCache::default();
+        let mut neighbours = Arc::new([[LeafId::OUTSIDE; 27]; PAGE_LEAVES]);
+        if let Some(neighbours) = Arc::get_mut(&mut neighbours) {
+            PageLeaves::new(page, self.live.word(page))
+                .for_each(|id| neighbours[id.slot()] = self.neighbours_of(id, &mut cache));
+        }
+        neighbours
     }
 
     fn neighbours_of<'a>(&'a self, id: LeafId, cache: &mut NodeCache<'a>) -> Neighbours {
         let origin = self.origin(id);
         let tables = cache.around(self, node_of(origin));
         let local: IVec3 = (origin >> 3) & (NODE_LEAVES - 1);
+        if let Some(table) = tables[13]
+            && local.min_element() > 0
+            && local.max_element() < NODE_LEAVES - 1
+        {
+            // All in one table: nine runs of three along z.
+            let first = entry_of_leaf(local - 1);
+            let mut around = [LeafId::OUTSIDE; 27];
+            for (run, entries) in around.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+                entries.copy_from_slice(&table[first + (run / 3 << 8) + (run % 3 << 4)..][..3]);
+            }
+            return around;
+        }
         std::array::from_fn(|q| {
             let leaf = local + neighbour_step(q);
             // -1, 0 or 1 for the node below, this one, the node above.
@@ -260,7 +331,7 @@ impl Topology {
                 }
             }
         }
-        self.neighbours = OnceLock::new();
+        self.forget_neighbours();
     }
 
     /// Gives every absent leaf the sign of the surface around it: along each row of leaves in z the sign is outside until
@@ -306,7 +377,7 @@ impl Topology {
             })
             .collect();
         self.nodes.extend(flooded);
-        self.neighbours = OnceLock::new();
+        self.forget_neighbours();
     }
 
     /// Where both this and `other` have no leaf, the sign becomes `sign(inside here, inside there)`. Entries that are leaves stay.
@@ -333,7 +404,7 @@ impl Topology {
                 }
             }
         }
-        self.neighbours = OnceLock::new();
+        self.forget_neighbours();
     }
 
     /// Boxes of absent leaves that are inside, each as its first origin and its edge in voxels (8, or 128 for a whole node), by origin.
@@ -380,11 +451,14 @@ fn set_entry(nodes: &mut FxHashMap<IVec3, Arc<NodeTable>>, origin: IVec3, id: Le
     std::mem::replace(&mut Arc::make_mut(table)[entry_of(origin)], id)
 }
 
-/// Tells every leaf of `around` what now lies in its centre's place.
-fn relink(table: &mut [Neighbours], around: &Neighbours, entry: impl Fn(LeafId) -> LeafId) {
+/// Tells every leaf of `around` whose neighbours are known that `entry` now lies in the middle.
+fn relink(table: &mut [OnceLock<Arc<NeighbourPage>>], around: &Neighbours, entry: LeafId) {
     for (q, &n) in around.iter().enumerate() {
-        if q != 13 && !n.is_sentinel() {
-            table[n.index()][26 - q] = entry(n);
+        if q != 13
+            && !n.is_sentinel()
+            && let Some(page) = table[n.page()].get_mut()
+        {
+            Arc::make_mut(page)[n.slot()][26 - q] = entry;
         }
     }
 }
@@ -502,9 +576,13 @@ mod tests {
             assert!(t.order().is_sorted_by_key(|id| key(t.origin(*id))));
             assert_eq!(t.order().len(), t.live().len());
         };
+        // One with only some of the neighbours looked up before the leaves change.
+        let mut partly = topology.clone();
+        partly.neighbours[2].get_or_init(|| topology.neighbours_of_page(2));
         check(&topology);
         let removed: Vec<_> = topology.order().iter().copied().step_by(3).map(|id| (id, LeafId::INSIDE)).collect();
         topology.remove(&removed);
+        partly.remove(&removed);
         check(&topology);
         let absent: Vec<_> =
             (-20..20).map(|i| IVec3::new(i, 2 * i, -i) * 8).filter(|o| topology.find(*o).is_sentinel()).collect();
@@ -513,6 +591,9 @@ mod tests {
         assert_eq!(added.len(), absent.len());
         check(&topology);
         assert_eq!(topology.page_count(), pages, "freed slots are used again");
+        partly.insert(&sorted(absent));
+        assert!(partly.neighbours.iter().any(|page| page.get().is_none()));
+        check(&partly);
     }
 
     #[test]

@@ -74,10 +74,9 @@ pub(crate) fn grid_of_parts(background: f32, parts: &[Vec<(IVec3, LeafValues, Le
     leaves.par_sort_unstable_by_key(|(o, ..)| (o.x, o.y, o.z));
     let origins: Vec<IVec3> = leaves.iter().map(|l| l.0).collect();
     let mut grid = Grid::from_origins(background, &origins);
-    // A fresh grid has its leaves in slot order, so the leaf of an id is found by counting.
-    let first = grid.leaves().first().map_or(0, |id| id.index());
+    let places = grid.places();
     grid.update_all(|id, values, mask| {
-        let (_, v, m) = leaves[id.index() - first];
+        let (_, v, m) = leaves[places[id.index()] as usize];
         values.clone_from(v);
         *mask = *m;
     });

@@ -124,12 +124,11 @@ impl Split {
     fn new(grid: &Grid, surface: &IsoSurface) -> Self {
         let leaves = grid.leaves();
         let parts: Vec<Parts> = grid.map_leaves(|id| split(*surface.inside(id)));
-        let mut first_part = vec![0u32; grid.neighbours().len()];
-        let mut place = vec![0u32; grid.neighbours().len()];
+        let mut first_part = vec![0u32; grid.slot_count()];
+        let place = grid.places();
         let mut total = 0;
-        for (i, (&id, parts)) in leaves.iter().zip(&parts).enumerate() {
+        for (&id, parts) in leaves.iter().zip(&parts) {
             first_part[id.index()] = total;
-            place[id.index()] = i as u32;
             total += parts.len() as u32;
         }
         let runs = runs_of(&grid.inside_tiles());

@@ -41,8 +41,6 @@ pub fn curvature_of(level_set: &LevelSet, kind: CurvatureKind, leaves: &LeafSet,
     let bytes = leaves.len() as u64 * (size_of::<LeafValues>() + size_of::<LeafMask>()) as u64;
     run.reserve(OPERATION, bytes, "a coarser grid needs less")?;
     let mut grid = source.zeroed_on(leaves);
-    // All tasks read the neighbours: computed before they start, not by the first of them.
-    source.neighbours();
     let voxel_size = level_set.voxel_size() as f32;
     grid.update_pages(leaves, |leaves, values, masks| {
         if !run.is_cancelled() {

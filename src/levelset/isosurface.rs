@@ -160,7 +160,7 @@ impl<'a> IsoSurface<'a> {
         let per_leaf = 2 * size_of::<LeafMask>() + size_of::<SurfaceLeaf>() + size_of::<Neighbours>() + 4;
         run.reserve(operation, (grid.leaves().len() * per_leaf) as u64, MEMORY_ADVICE)?;
         let around = grid.neighbours();
-        let mut signs = vec![LeafMask::EMPTY; around.len()];
+        let mut signs = vec![LeafMask::EMPTY; grid.slot_count()];
         if let Some(inside) = signs.get_mut(LeafId::INSIDE.index()) {
             *inside = LeafMask::FULL;
         }
@@ -172,7 +172,7 @@ impl<'a> IsoSurface<'a> {
             .into_iter()
             .flatten()
             .collect();
-        let mut places = vec![NO_SURFACE; around.len()];
+        let mut places = vec![NO_SURFACE; grid.slot_count()];
         let mut vertices = 0u32;
         for (place, leaf) in leaves.iter_mut().enumerate() {
             places[leaf.id.index()] = place as u32;

@@ -48,12 +48,11 @@ impl LevelSet {
         origins.sort_unstable_by_key(|o| (o.x, o.y, o.z));
         origins.dedup();
         let mut grid = Grid::from_origins(self.background(), &origins);
-        // A fresh grid has its leaves in slot order.
-        let first = grid.leaves().first().map_or(0, |id| id.index());
+        let places = grid.places();
         grid.update_all(|id, values, mask| {
             let mut accessor = self.grid.accessor();
             for offset in 0..LEAF_VOXELS {
-                let source = from(origins[id.index() - first] + offset_to_local(offset));
+                let source = from(origins[places[id.index()] as usize] + offset_to_local(offset));
                 values.0[offset] = accessor.value(source);
                 mask.set(offset, accessor.is_active(source));
             }
@@ -80,9 +79,9 @@ fn with_background(grid: &Grid, background: f32, change: impl Fn(f32) -> f32 + S
     let origins: Vec<IVec3> = grid.leaves().iter().map(|&id| grid.origin(id)).collect();
     let mut new = Grid::from_origins(background, &origins);
     let leaves = grid.leaves();
-    let first = new.leaves().first().map_or(0, |id| id.index());
+    let places = new.places();
     new.update_all(|id, values, mask| {
-        let source = leaves[id.index() - first];
+        let source = leaves[places[id.index()] as usize];
         *mask = LeafMask::EMPTY;
         let active = grid.mask(source);
         for (offset, value) in values.0.iter_mut().enumerate() {

@@ -40,7 +40,6 @@ pub fn sweep_distance(level_set: &LevelSet, half_width: f32, run: &RunOptions) -
     let background = background(half_width, level_set.transform());
     // Masks are the voxels that keep their value, until the end.
     let mut grid = source.blank(background);
-    source.neighbours();
     grid.update_pages(source.leaf_set(), |leaves, values, masks| {
         dispatch(Seed { source, voxel_size, background, leaves, values, masks });
     });
@@ -48,7 +47,6 @@ pub fn sweep_distance(level_set: &LevelSet, half_width: f32, run: &RunOptions) -
     let mut active = grid.leaf_set().clone();
     while !active.is_empty() {
         run.check(OPERATION)?;
-        grid.neighbours();
         let changed = next.par_update_pages(&active, |leaves, page| {
             let mut changed = Vec::new();
             dispatch(Round { grid: &grid, voxel_size, leaves, page, changed: &mut changed });
@@ -78,7 +76,6 @@ pub fn extend_field(level_set: &LevelSet, field: &Field, run: &RunOptions) -> Re
     let source = level_set.grid();
     reserve(source.leaves().len(), run)?;
     let voxel_size = level_set.voxel_size() as f32;
-    source.neighbours();
     let mut grid = source.zeroed();
     // Masks are the voxels that are to be computed, until the end.
     grid.update_pages(source.leaf_set(), |leaves, values, masks| {

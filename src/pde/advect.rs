@@ -11,7 +11,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::evolve::{Motion, Report, Until, drive};
-use super::step::{LeafKernel, Target};
+use super::step::{LeafKernel, Rows, Target};
 use super::tracker::Tracker;
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::Result;
@@ -185,15 +185,7 @@ impl LeafKernel for FirstOrder<'_> {
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(
-        &self,
-        simd: S,
-        grid: &Grid,
-        id: LeafId,
-        rows: LeafMask,
-        halo: &mut FaceHalo,
-        out: &mut LeafValues,
-    ) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, halo: &mut FaceHalo, out: &mut LeafValues) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         let scale = self.0.dt / self.0.voxel_size;
         rows.for_each_pair(
@@ -219,15 +211,7 @@ impl LeafKernel for Weno5<'_> {
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(
-        &self,
-        simd: S,
-        grid: &Grid,
-        id: LeafId,
-        rows: LeafMask,
-        halo: &mut StarHalo,
-        out: &mut LeafValues,
-    ) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, halo: &mut StarHalo, out: &mut LeafValues) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         let Transport { dt, voxel_size, .. } = self.0;
         let scale = dt / voxel_size;

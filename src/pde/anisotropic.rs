@@ -13,10 +13,10 @@
 
 use fearless_simd::{Simd, SimdBase};
 
-use super::step::{LeafKernel, Target};
+use super::step::{LeafKernel, Rows, Target};
 use super::{Direction, Report, SolverOptions, StopReason, TimeIntegrator, Tracker, UpwindScheme, WenoEpsilon};
 use crate::error::{EditError, Result};
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged};
+use crate::grid::{Grid, LeafId, LeafValues, PageLeaves, Paged};
 use crate::levelset::LevelSet;
 use crate::mesh::widened;
 use crate::region::{Region, RegionWeights, VoxelSet};
@@ -205,7 +205,6 @@ fn filtered(
     };
     let voxel_size = wide.voxel_size() as f32;
     let start = grid.value_pages();
-    grid.neighbours();
     let isotropic = |sigma: f32, voxels: &VoxelSet| {
         let source =
             KernelSource { normals: None, bends: None, sigma: [sigma; 2], critical: 1.0, fade: None, voxel_size };
@@ -349,7 +348,7 @@ impl LeafKernel for Take<'_> {
     fn scratch(&self) {}
 
     #[inline(always)]
-    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, (): &mut (), out: &mut LeafValues) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, (): &mut (), out: &mut LeafValues) {
         let id = self.from.find(grid.origin(id));
         one_sided(simd, self.direction, rows, self.values.get(id), self.from.values(id), out);
     }
@@ -369,7 +368,7 @@ impl LeafKernel for Bound<'_> {
     fn scratch(&self) {}
 
     #[inline(always)]
-    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, (): &mut (), out: &mut LeafValues) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, (): &mut (), out: &mut LeafValues) {
         let by = self.by.values(self.by.find(grid.origin(id)));
         one_sided(simd, self.direction, rows, grid.values(id), by, out);
     }
@@ -380,7 +379,7 @@ impl LeafKernel for Bound<'_> {
 fn one_sided<S: Simd>(
     simd: S,
     direction: Direction,
-    rows: LeafMask,
+    rows: Rows,
     new: &LeafValues,
     old: &LeafValues,
     out: &mut LeafValues,

@@ -7,10 +7,10 @@
 use fearless_simd::{Simd, SimdBase};
 
 use super::evolve::{Motion, Until, drive};
-use super::step::{LeafKernel, Target};
+use super::step::{LeafKernel, Rows, Target};
 use super::{Report, SolverOptions, TimeIntegrator, Tracker};
 use crate::error::{EditError, Result};
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues};
+use crate::grid::{Grid, LeafId, LeafValues};
 use crate::levelset::LevelSet;
 use crate::region::Region;
 use crate::run::RunOptions;
@@ -158,10 +158,11 @@ impl LeafKernel for BoxMean {
         simd: S,
         grid: &Grid,
         id: LeafId,
-        rows: LeafMask,
+        rows: Rows,
         (cube, scratch): &mut Self::Scratch,
         out: &mut LeafValues,
     ) {
+        let rows = rows.voxels();
         cube.gather(grid.value_pages(), &grid.neighbours()[id.index()], rows);
         box_mean(simd, cube, self.background, rows, scratch, out);
     }
@@ -186,10 +187,11 @@ impl LeafKernel for BoxMedian {
         simd: S,
         grid: &Grid,
         id: LeafId,
-        rows: LeafMask,
+        rows: Rows,
         (cube, scratch): &mut Self::Scratch,
         out: &mut LeafValues,
     ) {
+        let rows = rows.voxels();
         cube.gather(grid.value_pages(), &grid.neighbours()[id.index()], rows);
         box_median(simd, cube, rows, scratch, out);
     }
@@ -206,7 +208,7 @@ impl LeafKernel for Subtract {
     fn scratch(&self) {}
 
     #[inline(always)]
-    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, (): &mut (), out: &mut LeafValues) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, (): &mut (), out: &mut LeafValues) {
         let phi = &grid.values(id).0;
         rows.for_each_pair(
             #[inline(always)]

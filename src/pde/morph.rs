@@ -16,11 +16,11 @@
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
 
 use super::evolve::{Motion, Report, Until, drive};
-use super::step::{LeafKernel, Target};
+use super::step::{LeafKernel, Rows, Target};
 use super::tracker::Tracker;
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::Result;
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged, offset_to_local};
+use crate::grid::{Grid, LeafId, LeafValues, PageLeaves, Paged, offset_to_local};
 use crate::levelset::LevelSet;
 use crate::region::Region;
 use crate::run::RunOptions;
@@ -260,15 +260,7 @@ impl LeafKernel for FirstOrder<'_> {
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(
-        &self,
-        simd: S,
-        grid: &Grid,
-        id: LeafId,
-        rows: LeafMask,
-        halo: &mut FaceHalo,
-        out: &mut LeafValues,
-    ) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, halo: &mut FaceHalo, out: &mut LeafValues) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         rows.for_each_pair(
             #[inline(always)]
@@ -294,15 +286,7 @@ impl LeafKernel for Weno5<'_> {
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(
-        &self,
-        simd: S,
-        grid: &Grid,
-        id: LeafId,
-        rows: LeafMask,
-        halo: &mut StarHalo,
-        out: &mut LeafValues,
-    ) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, halo: &mut StarHalo, out: &mut LeafValues) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         rows.for_each_pair(
             #[inline(always)]

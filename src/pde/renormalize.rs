@@ -7,11 +7,11 @@
 
 use fearless_simd::{Simd, SimdBase, SimdFloat};
 
-use super::step::{LeafKernel, Target};
+use super::step::{LeafKernel, Rows, Target};
 use super::tracker::Tracker;
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::Result;
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues};
+use crate::grid::{Grid, LeafId, LeafValues};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 use crate::stencil::simd::Lanes;
@@ -70,7 +70,7 @@ impl LeafKernel for Unchanged {
     fn scratch(&self) {}
 
     #[inline(always)]
-    fn euler<S: Simd>(&self, _: S, grid: &Grid, id: LeafId, _: LeafMask, (): &mut (), out: &mut LeafValues) {
+    fn euler<S: Simd>(&self, _: S, grid: &Grid, id: LeafId, _: Rows, (): &mut (), out: &mut LeafValues) {
         out.0 = grid.values(id).0;
     }
 }
@@ -104,15 +104,7 @@ impl LeafKernel for FirstOrder {
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(
-        &self,
-        simd: S,
-        grid: &Grid,
-        id: LeafId,
-        rows: LeafMask,
-        halo: &mut FaceHalo,
-        out: &mut LeafValues,
-    ) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, halo: &mut FaceHalo, out: &mut LeafValues) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         // A copy, so that what depends on it alone is computed once a leaf.
         let step = self.0;
@@ -139,15 +131,7 @@ impl LeafKernel for Weno5 {
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(
-        &self,
-        simd: S,
-        grid: &Grid,
-        id: LeafId,
-        rows: LeafMask,
-        halo: &mut StarHalo,
-        out: &mut LeafValues,
-    ) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, halo: &mut StarHalo, out: &mut LeafValues) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         let Self(step, epsilon) = *self;
         rows.for_each_pair(

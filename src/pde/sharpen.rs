@@ -21,10 +21,10 @@ use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 
 use super::curvature_flow::upwind_gradient;
 use super::evolve::{Motion, Until, WHOLE_STEPS, drive};
-use super::step::{LeafKernel, Target};
+use super::step::{LeafKernel, Rows, Target};
 use super::{CurvatureFlow, Report, SolverOptions, TimeIntegrator, Tracker};
 use crate::error::Result;
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged};
+use crate::grid::{Grid, LeafId, LeafValues, PageLeaves, Paged};
 use crate::levelset::LevelSet;
 use crate::region::Region;
 use crate::run::RunOptions;
@@ -158,7 +158,7 @@ impl LeafKernel for Sharpen<'_> {
         simd: S,
         grid: &Grid,
         id: LeafId,
-        rows: LeafMask,
+        rows: Rows,
         (phi, curvature): &mut Self::Scratch,
         out: &mut LeafValues,
     ) {

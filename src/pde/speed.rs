@@ -2,8 +2,8 @@
 
 use fearless_simd::{Simd, SimdBase};
 
-use super::step::LeafKernel;
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues};
+use super::step::{LeafKernel, Rows};
+use crate::grid::{Grid, LeafId, LeafValues};
 use crate::stencil::LeafHalo;
 use crate::stencil::simd::Lanes;
 
@@ -44,15 +44,7 @@ impl<F: SpeedFunction> LeafKernel for FlowStep<'_, F> {
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(
-        &self,
-        simd: S,
-        grid: &Grid,
-        id: LeafId,
-        rows: LeafMask,
-        halo: &mut F::Halo,
-        out: &mut LeafValues,
-    ) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, halo: &mut F::Halo, out: &mut LeafValues) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         // Copies, so that what depends on them alone is computed once a leaf.
         let (dt, voxel_size) = (self.dt, self.voxel_size);

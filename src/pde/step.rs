@@ -6,7 +6,7 @@ use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 
 use super::domain::Domain;
 use super::tracker::Tracker;
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged, prefetch_faces};
+use crate::grid::{Ahead, Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged};
 use crate::stencil::simd::{self, Lanes, Work, with_sign};
 
 /// One explicit Euler step on a leaf.
@@ -20,17 +20,53 @@ pub(super) trait LeafKernel: Sync {
     /// New buffers.
     fn scratch(&self) -> Self::Scratch;
 
-    /// Computes φ + dt·L(φ) for the row pairs of leaf `id` that have a bit in `rows`; the others of `out` are not read.
+    /// Computes φ + dt·L(φ) for the row pairs of leaf `id` that have a voxel in `rows`; the others of `out` are not read.
     /// Reads values and neighbours of the grid, not its masks. Must be `#[inline(always)]`.
     fn euler<S: Simd>(
         &self,
         simd: S,
         grid: &Grid,
         id: LeafId,
-        rows: LeafMask,
+        rows: Rows,
         scratch: &mut Self::Scratch,
         out: &mut LeafValues,
     );
+}
+
+/// The rows of a leaf that a kernel computes. While it goes through them, the memory of the next leaf is brought into the cache.
+pub(super) struct Rows<'a> {
+    voxels: LeafMask,
+    ahead: Option<Ahead<'a>>,
+}
+
+impl Rows<'_> {
+    /// Calls `f` with x, y and the 16 bits of every pair of rows (x, y), (x, y + 1) that has a voxel to compute; y is even.
+    #[inline(always)]
+    pub fn for_each_pair(mut self, mut f: impl FnMut(usize, usize, u16)) {
+        self.voxels.for_each_pair(
+            #[inline(always)]
+            |x, y, bits| {
+                // A leaf has 32 pairs, and mostly more than half of them have a voxel.
+                if let Some(ahead) = &mut self.ahead {
+                    ahead.some();
+                    ahead.some();
+                }
+                f(x, y, bits);
+            },
+        );
+        if let Some(ahead) = &mut self.ahead {
+            ahead.rest();
+        }
+    }
+
+    /// The voxels to compute, for kernels that do not go through pairs of rows.
+    #[inline(always)]
+    pub fn voxels(mut self) -> LeafMask {
+        if let Some(ahead) = &mut self.ahead {
+            ahead.rest();
+        }
+        self.voxels
+    }
 }
 
 /// Which voxels a step writes.
@@ -81,8 +117,6 @@ impl Tracker<'_> {
         let several_buffers = self.buffers.len() > 1;
         let old = from.map(|i| &self.buffers[i]);
         let (grid, domain, run) = (&*self.grid, &self.domain, self.run);
-        // All tasks read the neighbours: computed before they start, not by the first of them.
-        grid.neighbours();
         if blend.old != 0.0 && old.is_none() {
             // The old values are read from the pages that are written.
             out.own_pages(domain.leaves());
@@ -152,10 +186,6 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
         self.leaves.for_each(
             #[inline(always)]
             |id| {
-                if let Some(next) = self.leaves.after(id) {
-                    prefetch_faces(self.grid.value_pages(), &neighbours[next.index()], K::REACH);
-                }
-                let out = &mut self.page[PageLeaves::slot(id)];
                 let phi = self.grid.values(id);
                 let mut mask = self.masks.as_mut().map(|masks| &mut masks[PageLeaves::slot(id)]);
                 let active = mask.as_ref().map_or_else(|| self.grid.mask(id), |mask| **mask);
@@ -163,14 +193,30 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
                     Target::Moving => (self.domain.moving(id, active), self.domain.weights().map(|w| w.alpha(id))),
                     Target::Repairable | Target::Trimmed => (self.domain.repairable(id, active), None),
                 };
+                if !write.is_empty() {
+                    let ahead = self.leaves.after(id).map(
+                        #[inline(always)]
+                        |next| {
+                            let written = &self.page[PageLeaves::slot(next)];
+                            Ahead::new(self.grid.value_pages(), &neighbours[next.index()], K::REACH, written)
+                        },
+                    );
+                    self.kernel.euler(simd, self.grid, id, Rows { voxels: write, ahead }, &mut scratch, &mut new);
+                }
+                let out = &mut self.page[PageLeaves::slot(id)];
                 if self.new_page || (self.domain.is_local() && self.blend.old == 0.0) {
-                    // The buffer may hold an older state of voxels that this step does not write.
-                    out.0 = phi.0;
+                    // The buffer may hold an older state of rows that this step does not write.
+                    write.for_each_empty_pair(
+                        #[inline(always)]
+                        |x, y| {
+                            let at = x * 64 + y * 8;
+                            load(simd, phi, at).store_slice(&mut out.0[at..at + 16]);
+                        },
+                    );
                 }
                 if write.is_empty() {
                     return;
                 }
-                self.kernel.euler(simd, self.grid, id, write, &mut scratch, &mut new);
                 let mut emptied = 0u32;
                 write.for_each_pair(
                     #[inline(always)]

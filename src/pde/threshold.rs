@@ -16,11 +16,11 @@ use fearless_simd::{Simd, SimdBase, SimdFloat};
 use glam::IVec3;
 
 use super::evolve::{Motion, Report, Until, drive};
-use super::step::{LeafKernel, Target};
+use super::step::{LeafKernel, Rows, Target};
 use super::tracker::Tracker;
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::{EditError, Result};
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged, offset_to_local};
+use crate::grid::{Grid, LeafId, LeafValues, PageLeaves, Paged, offset_to_local};
 use crate::levelset::LevelSet;
 use crate::region::Region;
 use crate::run::RunOptions;
@@ -131,7 +131,7 @@ impl LeafKernel for GrowthStep<'_> {
     }
 
     #[inline(always)]
-    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: LeafMask, halo: &mut Halo, out: &mut LeafValues) {
+    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, halo: &mut Halo, out: &mut LeafValues) {
         halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
         let (h, dt) = (self.voxel_size, self.dt);
         let bending = 2.0 * self.smoothness * h * h;

@@ -26,6 +26,11 @@ pub trait Region: Send + Sync {
     /// α in 0..1 at a world position.
     fn weight(&self, xyz: DVec3) -> f32;
 
+    /// α at each of several positions.
+    fn weights(&self, xyz: &[DVec3], alpha: &mut [f32]) {
+        alpha.iter_mut().zip(xyz).for_each(|(alpha, xyz)| *alpha = self.weight(*xyz));
+    }
+
     /// World-space box outside which α is 0; `None` if there is none.
     fn bounds(&self) -> Option<(DVec3, DVec3)>;
 

@@ -2,12 +2,12 @@
 
 use glam::{DVec3, IVec3};
 
-use crate::grid::{Grid, LEAF_DIM, LeafId, Neighbours, leaf_offset, leaf_origin};
+use crate::grid::{Grid, LEAF_DIM, LeafId, NeighbourTable, leaf_offset, leaf_origin};
 
 /// A level set's values with the tables that make neighbouring leaves cheap to read.
 pub(super) struct Field<'a> {
     grid: &'a Grid,
-    neighbours: &'a [Neighbours],
+    neighbours: NeighbourTable<'a>,
     /// Voxels per world unit: turns stored values into voxels.
     to_voxels: f64,
 }
@@ -71,7 +71,7 @@ impl Cursor<'_> {
         }
     }
 
-    /// The leaf `q` around the current one, numbered as in [`Neighbours`].
+    /// The leaf `q` around the current one, numbered as in [`Neighbours`](crate::grid::Neighbours).
     #[inline(always)]
     fn beside(&self, q: usize) -> LeafId {
         if self.id.is_sentinel() {

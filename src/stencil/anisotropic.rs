@@ -514,10 +514,9 @@ mod tests {
         let origins: Vec<_> = (0..125).map(|q| (IVec3::new(q / 25, q / 5 % 5, q % 5) - 2) * 8).collect();
         // Next to nothing beyond.
         let mut grid = Grid::from_origins(1e-20, &origins);
-        // A fresh grid has its leaves in slot order.
-        let first = grid.leaves()[0].index();
+        let places = grid.places();
         grid.update_all(|id, values, mask| {
-            let origin = origins[id.index() - first];
+            let origin = origins[places[id.index()] as usize];
             for (at, v) in values.0.iter_mut().enumerate() {
                 *v = value(origin + offset_to_local(at));
             }

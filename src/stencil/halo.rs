@@ -120,8 +120,8 @@ impl LeafHalo for Halo {
 /// A leaf with what stencils of ±REACH voxels along each axis read, REACH 1 or 3.
 #[repr(align(64))]
 pub struct StarHalo<const REACH: usize = 3> {
-    /// By x; fourteen rows of 8 along y.
-    slabs: [[f32; 112]; 14],
+    /// By x; sixteen rows of 8 along y, the leaf's from the fourth on: so its row pairs lie in one cache line each.
+    slabs: [[f32; 16 * ROW]; 14],
     /// The leaves below and above in z, with room for loads that begin or end beyond them.
     below: [f32; LEAF_VOXELS + ROW],
     above: [f32; LEAF_VOXELS + 2 * ROW],
@@ -129,6 +129,9 @@ pub struct StarHalo<const REACH: usize = 3> {
 
 /// Voxels of a row.
 const ROW: usize = 8;
+/// Where the leaf's values begin and end in a slab.
+const FIRST: usize = 4 * ROW;
+const LAST: usize = FIRST + 8 * ROW;
 
 /// For stencils over the six face neighbours.
 pub type FaceHalo = StarHalo<1>;
@@ -136,7 +139,7 @@ pub type FaceHalo = StarHalo<1>;
 impl<const REACH: usize> StarHalo<REACH> {
     /// A buffer to gather into.
     pub fn new() -> Self {
-        Self { slabs: [[0.0; 112]; 14], below: [0.0; LEAF_VOXELS + ROW], above: [0.0; LEAF_VOXELS + 2 * ROW] }
+        Self { slabs: [[0.0; 16 * ROW]; 14], below: [0.0; LEAF_VOXELS + ROW], above: [0.0; LEAF_VOXELS + 2 * ROW] }
     }
 
     /// Copies the leaf in the middle of `around` and the voxels beyond each of its faces.
@@ -144,15 +147,15 @@ impl<const REACH: usize> StarHalo<REACH> {
     pub fn gather(&mut self, values: &Paged<LeafValues>, around: &Neighbours) {
         let [centre, xm, xp, ym, yp, zm, zp] = leaves(values, around, [13, 4, 22, 10, 16, 12, 14]);
         for x in 0..REACH {
-            self.slabs[2 - x][24..88].copy_from_slice(slab(xm, 7 - x));
-            self.slabs[11 + x][24..88].copy_from_slice(slab(xp, x));
+            self.slabs[2 - x][FIRST..LAST].copy_from_slice(slab(xm, 7 - x));
+            self.slabs[11 + x][FIRST..LAST].copy_from_slice(slab(xp, x));
         }
         let rim = 8 * REACH;
         for x in 0..8 {
             let rows = &mut self.slabs[3 + x];
-            rows[24 - rim..24].copy_from_slice(&slab(ym, x)[64 - rim..]);
-            rows[24..88].copy_from_slice(slab(centre, x));
-            rows[88..88 + rim].copy_from_slice(&slab(yp, x)[..rim]);
+            rows[FIRST - rim..FIRST].copy_from_slice(&slab(ym, x)[64 - rim..]);
+            rows[FIRST..LAST].copy_from_slice(slab(centre, x));
+            rows[LAST..LAST + rim].copy_from_slice(&slab(yp, x)[..rim]);
         }
         self.below[..LEAF_VOXELS].copy_from_slice(zm);
         self.above[ROW..ROW + LEAF_VOXELS].copy_from_slice(zp);
@@ -161,16 +164,16 @@ impl<const REACH: usize> StarHalo<REACH> {
     /// Rows (x, y) and (x, y + 1) of the leaf.
     #[inline(always)]
     pub fn centre<S: Simd>(&self, simd: S, x: usize, y: usize) -> Lanes<S> {
-        Lanes::from_slice(simd, &self.slabs[x + 3][(y + 3) * 8..][..16])
+        Lanes::from_slice(simd, &self.slabs[x + 3][FIRST + y * ROW..][..16])
     }
 
     /// The rows `by` steps along `axis`.
     #[inline(always)]
     fn shifted_rows<S: Simd>(&self, simd: S, x: usize, y: usize, axis: usize, by: isize) -> Lanes<S> {
         let rows = match axis {
-            0 => &self.slabs[(x + 3).wrapping_add_signed(by)][(y + 3) * ROW..],
-            1 => &self.slabs[x + 3][(y + 3).wrapping_add_signed(by) * ROW..],
-            _ => &self.slabs[x + 3][((y + 3) * ROW).wrapping_add_signed(by)..],
+            0 => &self.slabs[(x + 3).wrapping_add_signed(by)][FIRST + y * ROW..],
+            1 => &self.slabs[x + 3][(FIRST / ROW + y).wrapping_add_signed(by) * ROW..],
+            _ => &self.slabs[x + 3][(FIRST + y * ROW).wrapping_add_signed(by)..],
         };
         let lanes = Lanes::from_slice(simd, &rows[..16]);
         if axis < 2 {

@@ -56,10 +56,12 @@ pub fn godunov_weno5<S: Simd>(
     // The mirror and the unit of differences in one factor: they are in voxel sizes.
     let (centre, unit) = (halo.centre(simd, x, y), mirror(simd, direction) * (1.0 / voxel_size));
     let weno = Weno5::new(epsilon, voxel_size);
-    let sum = godunov_weno5_axis(simd, centre, halo.along(simd, x, y, 0), wanted, unit, weno)
-        + godunov_weno5_axis(simd, centre, halo.along(simd, x, y, 1), wanted, unit, weno)
-        + godunov_weno5_axis(simd, centre, halo.along(simd, x, y, 2), wanted, unit, weno);
-    sum * (voxel_size * voxel_size)
+    let [x, y, z] = [
+        weno.upwind(simd, centre, halo.along(simd, x, y, 0), unit, wanted),
+        weno.upwind(simd, centre, halo.along(simd, x, y, 1), unit, wanted),
+        weno.upwind(simd, centre, halo.along(simd, x, y, 2), unit, wanted),
+    ];
+    (x * x + y * y + z * z) * (voxel_size * voxel_size)
 }
 
 /// V·Dφ (unscaled) of rows (x, y) and (x, y + 1) by first-order differences, taken on each axis from where V comes.
@@ -92,43 +94,14 @@ pub fn transport_weno5<S: Simd>(
     epsilon: WenoEpsilon,
 ) -> Lanes<S> {
     let (centre, zero) = (halo.centre(simd, x, y), Lanes::splat(simd, 0.0));
-    let (weno, unit) = (Weno5::new(epsilon, voxel_size), 1.0 / voxel_size);
+    let (weno, unit) = (Weno5::new(epsilon, voxel_size), Lanes::splat(simd, 1.0 / voxel_size));
     let mut sum = zero;
     for (axis, v) in velocity.into_iter().enumerate() {
-        let [m3, m2, m1, p1, p2, p3] = halo.along(simd, x, y, axis);
-        let (v1, v2, v3) = ((m2 - m3) * unit, (m1 - m2) * unit, (centre - m1) * unit);
-        let (v4, v5, v6) = ((p1 - centre) * unit, (p2 - p1) * unit, (p3 - p2) * unit);
-        let (behind, ahead) = (Side::new([v1, v2, v3, v4, v5]), Side::new([v6, v5, v4, v3, v2]));
-        sum += v * weno.difference(simd, &behind.select(v.simd_gt(zero), &ahead));
+        let axis = weno.axis(simd, centre, halo.along(simd, x, y, axis), unit);
+        // Seen from ahead, the difference is reversed; so is V.
+        sum += v.abs() * axis.behind.select(v.simd_gt(zero), &axis.ahead).difference(axis.floor);
     }
     sum * voxel_size
-}
-
-/// One axis of Godunov's |Dφ|² by HJ-WENO5 differences, from the values at −3, −2, −1, 1, 2, 3.
-#[inline(always)]
-fn godunov_weno5_axis<S: Simd>(
-    simd: S,
-    centre: Lanes<S>,
-    [m3, m2, m1, p1, p2, p3]: [Lanes<S>; 6],
-    wanted: mask32x16<S>,
-    unit: Lanes<S>,
-    weno: Weno5,
-) -> Lanes<S> {
-    let zero = Lanes::splat(simd, 0.0);
-    let (v1, v2, v3) = ((m2 - m3) * unit, (m1 - m2) * unit, (centre - m1) * unit);
-    let (v4, v5, v6) = ((p1 - centre) * unit, (p2 - p1) * unit, (p3 - p2) * unit);
-    let (behind, ahead) = (Side::new([v1, v2, v3, v4, v5]), Side::new([v6, v5, v4, v3, v2]));
-    // A side counts only where its difference has the right sign. WENO5's is a mean of three candidates: where all of them have
-    // the wrong one, so has it, and is not needed. Of a distance that is one side nearly everywhere: each lane computes the
-    // one that counts, and the other is computed only where a lane needs both.
-    let from_behind = behind.candidates[0].max(behind.candidates[1]).max(behind.candidates[2]).simd_gt(zero);
-    let from_ahead = ahead.candidates[0].min(ahead.candidates[1]).min(ahead.candidates[2]).simd_lt(zero);
-    let one = weno.difference(simd, &behind.select(from_behind, &ahead));
-    let mut other = zero;
-    if (from_behind & from_ahead & wanted).any_true() {
-        other = weno.difference(simd, &ahead);
-    }
-    godunov(simd, from_behind.select(one, zero), from_behind.select(other, one))
 }
 
 /// 1 where the direction is positive, else −1: for F ≤ 0 the mirrored field −φ obeys the rule for F > 0.
@@ -153,7 +126,7 @@ pub struct WenoEpsilon {
 }
 
 impl WenoEpsilon {
-    /// ε = 1e-6 · max(v²): the result does not depend on the voxel size.
+    /// ε = 1e-6 · max(v²) over the six differences along an axis: the result does not depend on the voxel size.
     pub const SCALE_FREE: Self = Self { relative: 1e-6, absolute: 0.0 };
 
     /// OpenVDB's absolute 1e-8 on unscaled differences: its results depend on the voxel size. For comparisons.
@@ -163,34 +136,63 @@ impl WenoEpsilon {
 /// The least ε in squared voxel sizes: its fourth power is still a normal f32, so that weights as products stay above zero.
 const LEAST_EPSILON: f32 = 1e-9;
 
-/// What one-sided WENO5 reads: five consecutive first differences, the upwind side first.
+/// One-sided WENO5: five consecutive first differences v₁ … v₅, the upwind end first, in voxel sizes.
 struct Side<S: Simd> {
-    /// The differences, in voxel sizes.
-    first: [Lanes<S>; 5],
-    /// Six times the third-order differences that WENO5 weighs: (2v₁ − 7v₂ + 11v₃), (−v₂ + 5v₃ + 2v₄), (2v₃ + 5v₄ − v₅).
-    candidates: [Lanes<S>; 3],
+    /// The one that touches the voxel, v₃.
+    first: Lanes<S>,
+    /// Second differences v₂ − v₁, v₃ − v₂, v₄ − v₃, v₅ − v₄.
+    second: [Lanes<S>; 4],
 }
 
 impl<S: Simd> Side<S> {
-    #[inline(always)]
-    fn new([v1, v2, v3, v4, v5]: [Lanes<S>; 5]) -> Self {
-        let candidates = [v1 * 2.0 - v2 * 7.0 + v3 * 11.0, v3 * 5.0 - v2 + v4 * 2.0, v3 * 2.0 + v4 * 5.0 - v5];
-        Self { first: [v1, v2, v3, v4, v5], candidates }
-    }
-
     /// This side where `mask` is set, the other elsewhere.
     #[inline(always)]
     fn select(&self, mask: mask32x16<S>, other: &Self) -> Self {
         macro_rules! each {
-            ($field:ident: $($i:literal)*) => {
-                [$(mask.select(self.$field[$i], other.$field[$i])),*]
+            ($($i:literal)*) => {
+                [$(mask.select(self.second[$i], other.second[$i])),*]
             };
         }
-        Self { first: each!(first: 0 1 2 3 4), candidates: each!(candidates: 0 1 2) }
+        Self { first: mask.select(self.first, other.first), second: each!(0 1 2 3) }
+    }
+
+    /// Six times the greatest of the three third-order differences that WENO5 weighs.
+    #[inline(always)]
+    fn greatest(&self) -> Lanes<S> {
+        let [e1, e2, e3, e4] = self.second;
+        let (c1, c2, c3) = (e2 * 5.0 - e1 * 2.0, e2 + e3 * 2.0, e3 * 4.0 - e4);
+        self.first * 6.0 + c1.max(c2).max(c3)
+    }
+
+    /// The mean of the three third-order differences, six times which are 6v₃ + 5e₂ − 2e₁, 6v₃ + e₂ + 2e₃ and 6v₃ + 4e₃ − e₄, by the
+    /// weights γₖ/(ε + βₖ)², γ = 0.1, 0.6, 0.3. `floor` is 4ε.
+    #[inline(always)]
+    fn difference(&self, floor: Lanes<S>) -> Lanes<S> {
+        let [e1, e2, e3, e4] = self.second;
+        // Four times ε + βₖ: β₁ = 13/12 (v₁ − 2v₂ + v₃)² + ¼ (v₁ − 4v₂ + 3v₃)² and so on, by second differences.
+        let (t1, t2, t3) = (e2 - e1, e3 - e2, e4 - e3);
+        let (b1, b2, b3) = (t1 + e2 * 2.0, e2 + e3, e3 * 2.0 - t3);
+        let s1 = smoothness(t1, b1, floor);
+        let s2 = smoothness(t2, b2, floor);
+        let s3 = smoothness(t3, b3, floor);
+        // The weights γ/s² times 10 (s₁s₂s₃)²: products instead of three quotients.
+        let (p1, p2, p3) = (s2 * s3, s1 * s3, s1 * s2);
+        let (a1, a2, a3) = (p1 * p1, p2 * p2 * 6.0, p3 * p3 * 3.0);
+        // What the candidates have beyond 6v₃.
+        let (c1, c2, c3) = (b1 + t1 + e2, b2 + e3, b3 + e3);
+        self.first + (a1 * c1 + a2 * c2 + a3 * c3) / ((a1 + a2 + a3) * 6.0)
     }
 }
 
-/// The fifth-order weighted difference.
+/// Both one-sided differences along an axis, D⁻ and −D⁺: seen from ahead, the differences and their order are reversed.
+struct Axis<S: Simd> {
+    behind: Side<S>,
+    ahead: Side<S>,
+    /// 4ε.
+    floor: Lanes<S>,
+}
+
+/// Fifth-order weighted differences.
 #[derive(Clone, Copy)]
 struct Weno5 {
     /// ε in squared voxel sizes.
@@ -205,25 +207,60 @@ impl Weno5 {
         Self { least: (epsilon.absolute * scale).max(LEAST_EPSILON), relative: epsilon.relative }
     }
 
-    /// The mean of the candidates with the weights γₖ/(ε + βₖ)², γ = 0.1, 0.6, 0.3.
+    /// Both sides of a voxel, from the values at −3, −2, −1, 1, 2, 3; `unit` brings differences to voxel sizes.
     #[inline(always)]
-    fn difference<S: Simd>(self, simd: S, side: &Side<S>) -> Lanes<S> {
-        let [v1, v2, v3, v4, v5] = side.first;
-        let mut floor = Lanes::splat(simd, 4.0 * self.least);
-        if self.relative > 0.0 {
-            let (a, b, c, d, e) = (v1 * v1, v2 * v2, v3 * v3, v4 * v4, v5 * v5);
-            floor = floor.max(a.max(b).max(c.max(d)).max(e) * (4.0 * self.relative));
+    fn axis<S: Simd>(
+        self,
+        simd: S,
+        centre: Lanes<S>,
+        [m3, m2, m1, p1, p2, p3]: [Lanes<S>; 6],
+        unit: Lanes<S>,
+    ) -> Axis<S> {
+        let (v1, v2, v3) = ((m2 - m3) * unit, (m1 - m2) * unit, (centre - m1) * unit);
+        let (v4, v5, v6) = ((p1 - centre) * unit, (p2 - p1) * unit, (p3 - p2) * unit);
+        let (e1, e2, e3, e4, e5) = (v2 - v1, v3 - v2, v4 - v3, v5 - v4, v6 - v5);
+        Axis {
+            behind: Side { first: v3, second: [e1, e2, e3, e4] },
+            // Twice reversed, second differences keep their sign.
+            ahead: Side { first: -v4, second: [e5, e4, e3, e2] },
+            floor: self.floor(simd, [v1, v2, v3, v4, v5, v6]),
         }
-        // Four times ε + βₖ: β₁ = 13/12 (v₁ − 2v₂ + v₃)² + ¼ (v₁ − 4v₂ + 3v₃)² and so on, by second differences.
-        let (e1, e2, e3, e4) = (v2 - v1, v3 - v2, v4 - v3, v5 - v4);
-        let s1 = smoothness(e2 - e1, e2 * 3.0 - e1, floor);
-        let s2 = smoothness(e3 - e2, e3 + e2, floor);
-        let s3 = smoothness(e4 - e3, e3 * 3.0 - e4, floor);
-        // The weights γ/s² times (s₁s₂s₃)²: products instead of three quotients.
-        let (p1, p2, p3) = (s2 * s3, s1 * s3, s1 * s2);
-        let (a1, a2, a3) = (p1 * p1 * 0.1, p2 * p2 * 0.6, p3 * p3 * 0.3);
-        let [d1, d2, d3] = side.candidates;
-        (a1 * d1 + a2 * d2 + a3 * d3) / ((a1 + a2 + a3) * 6.0)
+    }
+
+    /// 4ε of an axis with these differences.
+    #[inline(always)]
+    fn floor<S: Simd>(self, simd: S, [a, b, c, d, e, f]: [Lanes<S>; 6]) -> Lanes<S> {
+        let floor = Lanes::splat(simd, 4.0 * self.least);
+        if self.relative == 0.0 {
+            return floor;
+        }
+        let largest = a.abs().max(b.abs()).max(c.abs().max(d.abs())).max(e.abs().max(f.abs()));
+        floor.max(largest * largest * (4.0 * self.relative))
+    }
+
+    /// Godunov's choice along one axis for a field that is mirrored if F ≤ 0: max(D⁻, −D⁺, 0).
+    #[inline(always)]
+    fn upwind<S: Simd>(
+        self,
+        simd: S,
+        centre: Lanes<S>,
+        along: [Lanes<S>; 6],
+        unit: Lanes<S>,
+        wanted: mask32x16<S>,
+    ) -> Lanes<S> {
+        let (Axis { behind, ahead, floor }, zero) = (self.axis(simd, centre, along, unit), Lanes::splat(simd, 0.0));
+        // A side counts only where its difference is positive. WENO5's is a mean of three candidates: where none of them is positive,
+        // neither is it, and it is not needed. Of a distance that is one side nearly everywhere: each lane computes the one that
+        // counts, and the other is computed only where a lane needs both.
+        let from_behind = behind.greatest().simd_gt(zero);
+        let from_ahead = ahead.greatest().simd_gt(zero);
+        let mut upwind = behind.select(from_behind, &ahead).difference(floor).max(zero);
+        let both = from_behind & from_ahead & wanted;
+        if both.any_true() {
+            // Chosen lane by lane: what the others of a pair need must not matter.
+            upwind = both.select(upwind.max(ahead.difference(floor)), upwind);
+        }
+        upwind
     }
 }
 
@@ -245,7 +282,11 @@ mod tests {
             fn run<S: Simd>(self, simd: S) {
                 let splat = |v: f32| Lanes::splat(simd, v);
                 self.0(
-                    &mut |v, e| Weno5::new(e, 1.0).difference(simd, &Side::new(v.map(splat)))[0],
+                    &mut |v, e| {
+                        let [v1, v2, v3, v4, v5] = v.map(splat);
+                        let side = Side { first: v3, second: [v2 - v1, v3 - v2, v4 - v3, v5 - v4] };
+                        side.difference(Weno5::new(e, 1.0).floor(simd, [v1, v2, v3, v4, v5, v5]))[0]
+                    },
                     &mut |[p, b, a]| {
                         let sign = mirror(simd, splat(p));
                         godunov(simd, splat(b) * sign, splat(a) * sign)[0]

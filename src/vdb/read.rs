@@ -208,15 +208,14 @@ pub(super) fn read_grid(leaves: &ffi::Leaves, voxel_size: f64) -> Result<(Grid, 
     facts.take_tiles(leaves).map_err(|e| e.what().to_string())?;
     let background = facts.usable_background(voxel_size);
     let mut grid = Grid::from_origins(background, &origins);
-    // A fresh grid has its leaves in slot order.
-    let first = grid.leaves().first().map_or(0, |id| id.index());
+    let places = grid.places();
     let all = grid.leaf_set().clone();
     let pages = grid.update_pages(&all, |page, values, masks| {
         let mut facts = BandFacts::new(0.0);
         let mut failed = None;
         page.for_each(|id| {
             let (values, mask) = (&mut values[PageLeaves::slot(id)], &mut masks[PageLeaves::slot(id)]);
-            if let Err(e) = leaves.copy(order[id.index() - first].1, &mut values.0, &mut mask.0) {
+            if let Err(e) = leaves.copy(order[places[id.index()] as usize].1, &mut values.0, &mut mask.0) {
                 failed.get_or_insert(e.what().to_string());
             }
             // While the leaf is in the cache.

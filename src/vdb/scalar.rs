@@ -164,11 +164,10 @@ fn fill(
     inside: Inside,
 ) -> Result<(), String> {
     let background = grid.background();
-    // A fresh grid has its leaves in slot order.
-    let first = grid.leaves().first().map_or(0, |id| id.index());
+    let ranks = grid.places();
     let failed = std::sync::Mutex::new(None);
     grid.update_all(|id, values, mask| {
-        match places[id.index() - first].1 {
+        match places[ranks[id.index()] as usize].1 {
             Source::Constant(value) => values.0.fill(value),
             Source::Leaf(leaf) => {
                 let mut active = LeafMask::EMPTY;
