@@ -11,11 +11,13 @@ use std::collections::VecDeque;
 
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::csg::{CsgOperation, csg};
 use crate::error::Result;
-use crate::grid::{Grid, LEAF_VOXELS, LeafId, LeafMask, LeafSet, leaf_offset, leaf_origin, offset_to_local};
+use crate::grid::{
+    Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafSet, Transform, leaf_offset, leaf_origin, offset_to_local,
+};
 use crate::levelset::LevelSet;
 use crate::mesh::{Rebuild, rebuild, with_half_width};
 use crate::region::{Region, RegionWeights};
@@ -92,6 +94,67 @@ pub(super) fn kept(original: &LevelSet, mut edited: LevelSet, region: &dyn Regio
     merge.cut_to_kept(&mut edited, &mut changed);
     edited.grid_mut().prune(&changed);
     edited
+}
+
+/// The part of a level set in a box of index space and so many voxels around it, closed by its sides.
+pub(super) fn cut_out(
+    level_set: &LevelSet,
+    (lo, hi): (DVec3, DVec3),
+    margin: f64,
+    run: &RunOptions,
+) -> Result<LevelSet> {
+    IndexBox { lo, hi }.padded(margin).crop(level_set, run)
+}
+
+/// `level_set` with what an edited part of it has become in the leaves at these origins, where `region` is positive: all other active voxels
+/// keep their bits. The part holds those leaves and the band around them; both on one lattice.
+pub(super) fn put_back(
+    level_set: &LevelSet,
+    part: &LevelSet,
+    leaves: FxHashSet<IVec3>,
+    region: Option<&dyn Region>,
+) -> LevelSet {
+    let mut touched: Vec<IVec3> = leaves.iter().copied().collect();
+    touched.sort_unstable_by_key(|o| (o.x, o.y, o.z));
+    let changed = Leaves { leaves, region, transform: *level_set.transform() };
+    let around = IndexBox::around(&changed, level_set);
+    Merge::new(level_set, part.grid(), &changed, around).result(&touched)
+}
+
+/// Some leaves of a grid, in a region.
+struct Leaves<'a> {
+    leaves: FxHashSet<IVec3>,
+    region: Option<&'a dyn Region>,
+    transform: Transform,
+}
+
+impl Leaves<'_> {
+    fn holds(&self, xyz: DVec3) -> bool {
+        self.leaves.contains(&leaf_origin(self.transform.world_to_index(xyz).round().as_ivec3()))
+    }
+}
+
+impl Region for Leaves<'_> {
+    fn weight(&self, xyz: DVec3) -> f32 {
+        if self.holds(xyz) { self.region.map_or(1.0, |region| region.weight(xyz)) } else { 0.0 }
+    }
+
+    fn bounds(&self) -> Option<(DVec3, DVec3)> {
+        let corners = self
+            .leaves
+            .iter()
+            .flat_map(|o| (0..8).map(|c| IVec3::new(c >> 2 & 1, c >> 1 & 1, c & 1) * (LEAF_DIM - 1) + *o));
+        let world = corners.map(|ijk| self.transform.voxel_to_world(ijk));
+        Some(world.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), p| (lo.min(p), hi.max(p))))
+    }
+
+    fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
+        // It is asked for leaves, by their middle.
+        match self.holds(centre) {
+            true => self.region.map_or([1.0; 2], |region| region.weights_within(centre, radius)),
+            false => [0.0; 2],
+        }
+    }
 }
 
 /// φ ← (1 − α) φ + α φ_new where α > 0.

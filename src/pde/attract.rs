@@ -9,29 +9,31 @@
 //!
 //! C rises from 0 to 1 between two cosines, so that only what faces the target moves: a target at height d above a plane draws a
 //! disc of radius d·tan(arccos γ). Near the target that disc shrinks to a voxel, and a single point would never be reached. So within
-//! a few voxels of the target (`tip`) everything that does not face away is drawn: the limits fall to 0 and 0.2; beside the target everything is.
+//! a few voxels of the target (`tip`) everything that does not face away is drawn: the limits fall to 0 and 0.5.
 //!
-//! F depends on the normal: where C rises, a change of the normal travels along the surface towards the target at the speed |φ(p)| C′(γ) |u − (n·u)n|,
-//! many times faster than the surface itself moves. So the normal is taken a voxel upwind of y, and that speed bounds the step as well: with central
-//! differences and longer steps, flanks break up into pits.
+//! F depends on the normal, so that where C rises, changes of the normal travel along the surface many times faster than it moves. What
+//! keeps that from breaking up flanks into pits is the scheme: central normals at y, Euler steps of the first-order upwind gradient of at most a
+//! quarter of a voxel, each on a field whose distances are restored from its zero set by [`sweep_distance`] in a band as wide as the stencils
+//! reach. Voxels beside the surface alone are moved; all others are new in each step. The band of the result is rebuilt exactly.
+//!
+//! Sweeping rounds sharp edges by up to a voxel in the leaves around what moves. A target deep inside draws all sides that face it, not the
+//! nearest alone: a region holds the others.
 //!
 //! Pushed surfaces move by −F, faster and faster: a largest depth, measured from where the surface was, or a time ends it.
 
 use glam::{DVec3, IVec3};
-use rustc_hash::FxHashSet;
+use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::evolve::{Motion, Report, StopReason, Until, drive};
-use super::morph::{FirstOrder, MorphSpeed, MorphStep};
-use super::step::Target;
-use super::tracker::Tracker;
-use super::{CutOff, SolverOptions, TimeIntegrator};
-use crate::error::Result;
-use crate::grid::{
-    Grid, LEAF_DIM, LeafId, LeafSet, LeafValues, PageLeaves, Paged, Transform, leaf_origin, offset_to_local,
-};
-use crate::levelset::{LevelSet, Sampler};
+use super::CutOff;
+use super::evolve::{Report, StopReason, Until};
+use crate::error::{EditError, Result};
+use crate::grid::{LEAF_DIM, LeafId, LeafSet, offset_to_local};
+use crate::levelset::{LevelSet, Sampler, sweep_distance};
+use crate::mesh::{Rebuild, rebuild, with_half_width};
 use crate::region::{Region, ramp_between};
 use crate::run::RunOptions;
+
+const OPERATION: &str = "attraction";
 
 /// What draws a surface.
 pub trait Attractor: Sync {
@@ -44,8 +46,8 @@ pub trait Attractor: Sync {
 pub struct Attraction {
     /// C of the cosine γ.
     pub cut_off: CutOff,
-    /// Distance from the target, in voxels, within which all that does not face away is drawn, and in the nearest part of it everything. 0 for
-    /// the limits alone.
+    /// Distance from the target, in voxels, within which all that does not face away is drawn, fully within half of it. 0 for the
+    /// limits alone.
     pub tip: f64,
     /// Away from the target instead of towards it.
     pub repel: bool,
@@ -76,31 +78,37 @@ pub struct AttractionReport {
     pub gap: f64,
     /// Whether it ended because nothing comes nearer any more although something is still drawn.
     pub stalled: bool,
+    /// Origins of the leaves in which anything moved.
+    pub moved: FxHashSet<IVec3>,
 }
 
 /// A target nearer than this, in voxels, is reached.
 pub const REACHED: f64 = 0.25;
 
-/// Motion of the surface in a step, in voxels: φ(p) is to be refreshed at least every half voxel.
-const COURANT: f64 = 0.5;
+/// Gap in voxels up to which it goes on: where the band is rebuilt, tips are cut by up to an eighth of a voxel.
+const CLOSED: f64 = REACHED / 4.0;
 
-/// Longest step where a time was asked for: a step closes its part of the gap, and a tenth keeps that within 5 % of e^(−t).
-const LONGEST_TIMED: f64 = 0.1;
+/// Motion of the surface in a step, in voxels.
+const COURANT: f64 = 0.25;
+
+/// Longest step where a time was asked for: a step closes its part of the gap, and a twentieth keeps that within 3 % of e^(−t).
+const LONGEST_TIMED: f64 = 0.05;
 
 /// Longest step where only the end matters.
-const LONGEST_STEP: f64 = 0.5;
+const LONGEST_STEP: f64 = 0.1;
 
-/// Largest way in a step, in voxels, of what travels along the surface.
-const TRAVEL: f64 = 2.0;
+/// Least half width, in voxels, of the band it works on: φ(p) is a distance within it.
+const BAND: f32 = 7.0;
 
-/// Half the interval of cosines over which C′ is measured.
-const SLOPE_STEP: f64 = 0.02;
+/// Voxels that are moved lie within so many voxels of the surface: those beside it, which restore the others, and the neighbours that their
+/// gradients are taken from.
+const MOVED: f64 = 2.0;
 
 /// The cosine from which on a surface within the tip is drawn fully.
-const SIDEWAYS: f64 = 0.2;
+const SIDEWAYS: f64 = 0.5;
 
-/// Part of the tip within which all of a surface is drawn.
-const BESIDE: f64 = 0.4;
+/// Most steps in the time that is asked for: one that needs more was meant otherwise.
+const MOST_STEPS: f64 = 1e6;
 
 /// Voxels with less of the pull do not tell whether all that draws is reached: the rim of a region would never be.
 const DRAWN: f32 = 0.5;
@@ -108,113 +116,99 @@ const DRAWN: f32 = 0.5;
 /// Steps without progress after which a flow is at rest.
 const PATIENCE: u32 = 40;
 
-/// What counts as progress, in voxels: a fall of the mean distance of what is drawn from its targets.
+/// What counts as progress, in voxels: a fall of the largest gap, or of the mean distance of what is drawn from its targets.
 const PROGRESS: f64 = 0.01;
 
 /// Voxels around what is drawn and what draws it that may change as well.
 const MARGIN: f64 = 6.0;
 
-/// Draws a level set to `target`, where `region` lets it, until every point that draws is reached (within [`REACHED`]), nothing comes nearer,
-/// or `until`. The time unit is that in which a gap falls to 1/e.
+/// A box in index space.
+pub type IndexBounds = (DVec3, DVec3);
+
+/// Draws a level set to `target`, where `region` lets it and `within` a box (that of [`drawn_within`]), until every point that draws is reached
+/// (within [`REACHED`]), nothing comes nearer, or `until`. The time unit is that in which a gap falls to 1/e.
 ///
-/// Only a box around what is drawn at the start and what draws it is touched, and in it only leaves that are drawn or beside such leaves: all
-/// other voxels keep their bits.
+/// The whole band is rebuilt if anything moves; the report says in which leaves something did.
 pub fn attract(
     level_set: &mut LevelSet,
     target: &dyn Attractor,
     how: &Attraction,
     region: Option<&dyn Region>,
+    within: IndexBounds,
     until: Until,
-    solver: &SolverOptions,
     run: &RunOptions,
 ) -> Result<AttractionReport> {
-    let Some((bounds, drawn)) = drawn_bounds(level_set, target, how, region, run)? else {
-        let voxels = level_set.grid().active_voxels();
-        let flow = Report { steps: 0, time: 0.0, voxels, stopped: StopReason::AtRest };
-        return Ok(AttractionReport { flow, gap: 0.0, stalled: false });
+    let (most, end) = match until {
+        Until::Iterations(n) | Until::Rest(n) => (n, f64::INFINITY),
+        Until::Time(t) if t >= 0.0 && t.is_finite() => (u32::MAX, t),
+        Until::Time(t) => return Err(EditError::parameter(OPERATION, "time", t, "0 or more")),
     };
-    let grid = level_set.grid();
-    let near: FxHashSet<IVec3> = drawn.iter().flat_map(|&origin| around(origin)).collect();
-    let idle = grid.leaves().iter().map(|&id| grid.origin(id)).filter(|origin| !near.contains(origin)).collect();
-    let within = Within { bounds, region, idle, transform: *level_set.transform() };
+    let half_width = level_set.half_width();
     // Depths are measured in the field as it was.
     let original = match how.max_depth {
-        Some(depth) => {
-            Some(crate::mesh::with_half_width(level_set, level_set.half_width().max(depth as f32 + 2.0), run)?)
-        }
+        Some(depth) => Some(with_half_width(level_set, half_width.max(depth as f32 + 2.0), run)?),
         None => None,
     };
-    let mut tracker = Tracker::new(level_set, Some(&within), *solver, run);
     let pull = Pull { target, how, original };
-    let mut motion = Drawing {
+    let mut drawing = Drawing {
         pull,
-        speed: Paged::default(),
-        awake: None,
-        drawn: Vec::new(),
+        region,
+        within,
+        drawn: None,
         gap: 0.0,
-        mean: f64::INFINITY,
+        least: [f64::INFINITY; 2],
         patience: PATIENCE,
+        moved: FxHashSet::default(),
     };
-    let flow = drive(&mut tracker, &mut motion, until)?;
-    Ok(AttractionReport { flow, gap: motion.gap, stalled: motion.patience == 0 })
-}
-
-/// What may move: a box in world space, less the leaves that had a surface at the start which nothing draws, and a region.
-struct Within<'a> {
-    bounds: (DVec3, DVec3),
-    region: Option<&'a dyn Region>,
-    /// Origins of leaves.
-    idle: FxHashSet<IVec3>,
-    transform: Transform,
-}
-
-impl Within<'_> {
-    fn is_idle(&self, xyz: DVec3) -> bool {
-        self.idle.contains(&leaf_origin(self.transform.world_to_index(xyz).round().as_ivec3()))
+    let mut wide = sweep_distance(level_set, half_width.max(BAND), run)?;
+    let mut flow = Report {
+        steps: 0,
+        time: 0.0,
+        voxels: level_set.grid().active_voxels(),
+        stopped: if end.is_finite() { StopReason::Time } else { StopReason::Iterations },
+    };
+    let mut task = None;
+    while flow.steps < most && flow.time < end {
+        run.check(OPERATION)?;
+        let left = end - flow.time;
+        let Some((rates, dt)) = drawing.prepare(&wide, left) else {
+            flow.stopped = StopReason::AtRest;
+            break;
+        };
+        if end.is_finite() && left / dt > MOST_STEPS {
+            let accepted = format!("0 to {} at this voxel size", dt * MOST_STEPS);
+            return Err(EditError::parameter(OPERATION, "time", end, accepted));
+        }
+        let steps_left = if end.is_finite() { (left / dt).ceil() as u32 } else { most - flow.steps };
+        let task = task.get_or_insert_with(|| run.task("evolving", u64::from(steps_left)));
+        let leaves: LeafSet = rates.iter().map(|(id, _)| *id).collect();
+        let rates: FxHashMap<usize, LeafRates> = rates.into_iter().map(|(id, rates)| (id.index(), rates)).collect();
+        wide.grid_mut().update(&leaves, |id, values, _| {
+            for (at, rate) in rates.get(&id.index()).into_iter().flatten() {
+                values.0[usize::from(*at)] -= dt as f32 * rate;
+            }
+        });
+        wide = sweep_distance(&wide, half_width.max(BAND), run)?;
+        flow.steps += 1;
+        flow.time = if dt == left { end } else { flow.time + dt };
+        task.advance(1);
     }
+    if flow.steps > 0 {
+        *level_set = rebuild(&wide, &Rebuild::band(half_width), run)?;
+    }
+    let Drawing { gap, patience, moved, .. } = drawing;
+    Ok(AttractionReport { flow, gap, stalled: patience == 0, moved })
 }
 
 /// The origins of a leaf and of the 26 around it.
-fn around(origin: IVec3) -> impl Iterator<Item = IVec3> {
+pub fn leaves_around(origin: IVec3) -> impl Iterator<Item = IVec3> {
     (0..27).map(move |n| origin + IVec3::new(n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1) * LEAF_DIM)
-}
-
-impl Region for Within<'_> {
-    fn weight(&self, xyz: DVec3) -> f32 {
-        let (lo, hi) = self.bounds;
-        match xyz.cmpge(lo).all() && xyz.cmple(hi).all() && !self.is_idle(xyz) {
-            true => self.region.map_or(1.0, |region| region.weight(xyz)),
-            false => 0.0,
-        }
-    }
-
-    fn bounds(&self) -> Option<(DVec3, DVec3)> {
-        let (lo, hi) = self.bounds;
-        let other = self.region.and_then(|region| region.bounds());
-        Some(other.map_or((lo, hi), |(a, b)| (lo.max(a), hi.min(b).max(lo.max(a)))))
-    }
-
-    fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
-        let (lo, hi) = self.bounds;
-        if (centre + radius).cmplt(lo).any() || (centre - radius).cmpgt(hi).any() {
-            return [0.0; 2];
-        }
-        let [low, high] = self.region.map_or([1.0; 2], |region| region.weights_within(centre, radius));
-        // It is asked for leaves, by their middle.
-        if self.is_idle(centre) {
-            return [0.0; 2];
-        }
-        let all = (centre - radius).cmpge(lo).all() && (centre + radius).cmple(hi).all();
-        [if all { low } else { 0.0 }, high]
-    }
 }
 
 /// What a voxel feels.
 struct Felt {
     /// F, world units a unit of time.
     speed: f32,
-    /// |φ(p)| C′(γ) |u − (n·u)n|: how fast a change of the normal travels along the surface.
-    transport: f32,
     /// C.
     share: f32,
     /// |φ(p)| in voxels, or how far a pushed surface still goes.
@@ -235,25 +229,14 @@ struct Pull<'a> {
 impl Pull<'_> {
     /// What the voxel at `ijk` feels; `None` where the field has no normal, or without a target.
     fn at(&self, sampler: &mut Sampler, voxel_size: f64, ijk: IVec3) -> Option<Felt> {
-        let (foot, mut normal) = foot(sampler, voxel_size, ijk)?;
+        let (foot, normal) = foot(sampler, voxel_size, ijk)?;
         let point = self.target.closest(foot)?;
         let (to, phi) = (point - foot, f64::from(sampler.trilinear(point)));
         let distance = to.length();
-        let aside = to - normal * normal.dot(to);
-        if aside.length() > 1e-6 {
-            // Against the wind: what happens at the rim of C travels to the target, or from it.
-            let upwind = aside * (aside.length().min(1.0) / aside.length());
-            let from = if self.how.repel { foot + upwind } else { foot - upwind };
-            normal = sampler.smooth_gradient(from).try_normalize()?;
-        }
         let cosine = if distance > 1e-6 { normal.dot(to) / distance * phi.signum() } else { 1.0 };
-        let within = |reach: f64| if reach > 0.0 { 1.0 - ramp_between(distance, reach / 2.0, reach) } else { 0.0 };
-        let (near, beside) = (within(self.how.tip), within(self.how.tip * BESIDE));
-        let share_at =
-            |cosine: f64| self.how.cut_off.weight(cosine).max(near * ramp_between(cosine, 0.0, SIDEWAYS)).max(beside);
-        let mut share = share_at(cosine);
-        let slope = (share_at(cosine + SLOPE_STEP) - share_at(cosine - SLOPE_STEP)).abs() / (2.0 * SLOPE_STEP);
-        let transport = slope * phi.abs() * (1.0 - cosine * cosine).max(0.0).sqrt();
+        let tip = self.how.tip;
+        let near = if tip > 0.0 { 1.0 - ramp_between(distance, tip / 2.0, tip) } else { 0.0 };
+        let mut share = self.how.cut_off.weight(cosine).max(near * ramp_between(cosine, 0.0, SIDEWAYS));
         let mut gap = phi.abs() / voxel_size;
         let mut speed = phi;
         if self.how.repel {
@@ -270,8 +253,7 @@ impl Pull<'_> {
                 share = 0.0;
             }
         }
-        let (speed, transport) = ((share * speed) as f32, transport as f32);
-        Some(Felt { speed, transport, share: share as f32, gap, distance, point })
+        Some(Felt { speed: (share * speed) as f32, share: share as f32, gap, distance, point })
     }
 }
 
@@ -290,17 +272,14 @@ fn foot(sampler: &mut Sampler, voxel_size: f64, ijk: IVec3) -> Option<(DVec3, DV
     Some((foot, gradient / squared.sqrt()))
 }
 
-/// A world-space box and the origins of leaves.
-type Drawn = ((DVec3, DVec3), Vec<IVec3>);
-
-/// World-space box around what is drawn and what draws it, with a margin, and the leaves that are drawn; `None` if nothing is.
-fn drawn_bounds(
+/// A box around what is drawn and what draws it, with a margin; `None` if nothing is drawn.
+pub fn drawn_within(
     level_set: &LevelSet,
     target: &dyn Attractor,
     how: &Attraction,
     region: Option<&dyn Region>,
     run: &RunOptions,
-) -> Result<Option<Drawn>> {
+) -> Result<Option<IndexBounds>> {
     let (grid, transform, voxel_size) = (level_set.grid(), level_set.transform(), level_set.voxel_size());
     // At the start nothing has been pushed: no depth counts yet.
     let how = Attraction { max_depth: None, ..*how };
@@ -314,7 +293,7 @@ fn drawn_bounds(
             return None;
         }
         let (values, mut sampler) = (grid.values(id), level_set.sampler());
-        let mut bounds: Option<(DVec3, DVec3)> = None;
+        let mut bounds: Option<IndexBounds> = None;
         for offset in grid.mask(id).iter() {
             // The voxels beside the surface stand for the others on their normals.
             if f64::from(values.0[offset].abs()) > voxel_size {
@@ -330,123 +309,97 @@ fn drawn_bounds(
                 bounds = Some(bounds.map_or((a, b), |(lo, hi)| (lo.min(a), hi.max(b))));
             }
         }
-        bounds.map(|bounds| (bounds, origin))
+        bounds
     });
-    run.check("attraction")?;
-    let leaves: Vec<IVec3> = boxes.iter().flatten().map(|(_, origin)| *origin).collect();
-    let bounds = boxes.into_iter().flatten().map(|(bounds, _)| bounds).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
-    let margin = f64::from(level_set.half_width()) + MARGIN;
-    Ok(bounds.map(|(lo, hi)| {
-        let corners = (0..8).map(|c| {
-            let pick = |bit: i32, axis: usize| if c & bit == 0 { lo[axis] - margin } else { hi[axis] + margin };
-            transform.index_to_world(DVec3::new(pick(4, 0), pick(2, 1), pick(1, 2)))
-        });
-        (corners.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), c| (lo.min(c), hi.max(c))), leaves)
-    }))
+    run.check(OPERATION)?;
+    let bounds = boxes.into_iter().flatten().reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
+    Ok(bounds.map(|(lo, hi)| (lo - MARGIN, hi + MARGIN)))
 }
 
-struct Drawing<'a> {
-    pull: Pull<'a>,
-    /// F of the step.
-    speed: Paged<LeafValues>,
-    /// The leaves that are looked at; all of them at first.
-    awake: Option<LeafSet>,
-    /// Origins of the leaves that were drawn in the last step.
-    drawn: Vec<IVec3>,
-    gap: f64,
-    /// Mean distance from the targets at the last progress, and the steps left to make some.
-    mean: f64,
-    patience: u32,
-}
+/// Offsets of voxels of a leaf, with F|∇φ|.
+type LeafRates = Vec<(u16, f32)>;
 
-/// What the leaves of a page feel.
+/// What the voxels of a leaf feel.
 #[derive(Default)]
-struct PageFelt {
+struct LeafFelt {
+    rates: LeafRates,
     fastest: f32,
-    transport: f32,
     gap: f64,
     /// Sum over the voxels that are drawn, and their number.
     distance: f64,
     count: f64,
-    drawn: Vec<LeafId>,
+}
+
+struct Drawing<'a> {
+    pull: Pull<'a>,
+    region: Option<&'a dyn Region>,
+    within: IndexBounds,
+    /// Origins of the leaves that were drawn in the last step, and those around them: what lies elsewhere has not moved, and so is not drawn
+    /// now. None at first.
+    drawn: Option<FxHashSet<IVec3>>,
+    gap: f64,
+    /// Largest gap and mean distance from the targets at the last progress, and the steps left to make some.
+    least: [f64; 2],
+    patience: u32,
+    moved: FxHashSet<IVec3>,
 }
 
 impl Drawing<'_> {
-    /// F on the leaves of one page.
-    fn feel(&self, tracker: &Tracker, leaves: PageLeaves, speed: &mut [LeafValues]) -> PageFelt {
-        let (grid, voxel_size) = (tracker.grid(), f64::from(tracker.voxel_size()));
-        let mut sampler = Sampler::new(grid, voxel_size);
-        let mut all = PageFelt::default();
-        leaves.for_each(|id| {
-            let speed = &mut speed[PageLeaves::slot(id)];
-            speed.0.fill(0.0);
-            if self.awake.as_ref().is_some_and(|awake| !awake.contains(id)) {
-                return;
+    fn feel(&self, level_set: &LevelSet, id: LeafId) -> LeafFelt {
+        let (grid, voxel_size) = (level_set.grid(), level_set.voxel_size());
+        let (origin, values) = (grid.origin(id), grid.values(id));
+        let mut felt = LeafFelt::default();
+        let (lo, hi) = self.within;
+        let last = origin + (LEAF_DIM - 1);
+        let apart = last.as_dvec3().cmplt(lo).any() || origin.as_dvec3().cmpgt(hi).any();
+        if apart || self.drawn.as_ref().is_some_and(|drawn| !drawn.contains(&origin)) {
+            return felt;
+        }
+        let mut sampler = level_set.sampler();
+        for offset in grid.mask(id).iter() {
+            if f64::from(values.0[offset].abs()) > MOVED * voxel_size {
+                continue;
             }
-            let origin = grid.origin(id);
-            let alpha = tracker.domain.weights().map(|weights| weights.alpha(id));
-            let mut drawn = false;
-            for offset in tracker.domain.moving(id, grid.mask(id)).iter() {
-                let ijk = origin + offset_to_local(offset);
-                let Some(felt) = self.pull.at(&mut sampler, voxel_size, ijk) else { continue };
-                if felt.speed == 0.0 {
-                    continue;
-                }
-                speed.0[offset] = felt.speed;
-                drawn = true;
-                all.fastest = all.fastest.max(felt.speed.abs());
-                all.transport = all.transport.max(felt.transport);
-                if felt.share * alpha.map_or(1.0, |alpha| alpha.0[offset]) >= DRAWN {
-                    all.gap = all.gap.max(felt.gap);
-                    all.distance += felt.distance;
-                    all.count += 1.0;
-                }
+            let ijk = origin + offset_to_local(offset);
+            if ijk.as_dvec3().cmplt(lo).any() || ijk.as_dvec3().cmpgt(hi).any() {
+                continue;
             }
-            if drawn {
-                all.drawn.push(id);
+            let alpha = self.region.map_or(1.0, |region| region.weight(level_set.transform().voxel_to_world(ijk)));
+            if alpha <= 0.0 {
+                continue;
             }
-        });
-        all
-    }
-
-    /// The leaves drawn before and those around them: what lies elsewhere has not moved, and so is not drawn now.
-    fn wake(&mut self, grid: &Grid) {
-        let mut awake = LeafSet::default();
-        for &origin in &self.drawn {
-            for beside in around(origin) {
-                let id = grid.find(beside);
-                if !id.is_sentinel() {
-                    awake.insert(id);
-                }
+            let Some(voxel) = self.pull.at(&mut sampler, voxel_size, ijk) else { continue };
+            let speed = voxel.speed * alpha;
+            if speed == 0.0 {
+                continue;
+            }
+            felt.rates.push((offset as u16, speed * upwind_gradient(&mut sampler, ijk, voxel_size, speed)));
+            felt.fastest = felt.fastest.max(speed.abs());
+            if voxel.share * alpha >= DRAWN {
+                felt.gap = felt.gap.max(voxel.gap);
+                felt.distance += voxel.distance;
+                felt.count += 1.0;
             }
         }
-        self.awake = Some(awake);
+        felt
     }
-}
 
-impl Motion for Drawing<'_> {
-    fn prepare(&mut self, tracker: &Tracker, left: f64) -> Option<f64> {
-        let grid = tracker.grid();
-        if !self.drawn.is_empty() {
-            self.wake(grid);
-        }
-        let pages = grid.value_pages().page_count();
-        let mut speed = std::mem::take(&mut self.speed);
-        speed.truncate(pages);
-        speed.grow_unwritten(pages);
-        let felt = speed.par_update_pages(tracker.domain.leaves(), |leaves, page| self.feel(tracker, leaves, page));
-        self.speed = speed;
+    /// The rates of the leaves that move and the time step; `None` if nothing moves any more.
+    fn prepare(&mut self, level_set: &LevelSet, left: f64) -> Option<(Vec<(LeafId, LeafRates)>, f64)> {
+        let grid = level_set.grid();
+        let felt = grid.map_leaves(|id| self.feel(level_set, id));
         let fastest = felt.iter().map(|f| f.fastest).fold(0.0, f32::max);
         let count: f64 = felt.iter().map(|f| f.count).sum();
         let mean = felt.iter().map(|f| f.distance).sum::<f64>() / count.max(1.0);
         self.gap = felt.iter().map(|f| f.gap).fold(0.0, f64::max);
-        self.drawn = felt.iter().flat_map(|f| &f.drawn).map(|&id| grid.origin(id)).collect();
         let endless = self.pull.how.repel && self.pull.how.max_depth.is_none();
-        if fastest == 0.0 || (!endless && self.gap < REACHED) {
+        if fastest == 0.0 || (!endless && self.gap < CLOSED) {
             return None;
         }
-        if mean < self.mean - PROGRESS {
-            (self.mean, self.patience) = (mean, PATIENCE);
+        for (least, now) in self.least.iter_mut().zip([self.gap, mean]) {
+            if now < *least - PROGRESS {
+                (*least, self.patience) = (now, PATIENCE);
+            }
         }
         if !endless {
             self.patience -= 1;
@@ -454,17 +407,33 @@ impl Motion for Drawing<'_> {
                 return None;
             }
         }
-        let transport = felt.iter().map(|f| f.transport).fold(0.0, f32::max);
-        let voxel_size = f64::from(tracker.voxel_size());
-        let largest = (COURANT * voxel_size / f64::from(fastest)).min(TRAVEL * voxel_size / f64::from(transport));
-        Some(largest.min(if left.is_finite() { LONGEST_TIMED } else { LONGEST_STEP }).min(left))
+        let rates: Vec<(LeafId, LeafRates)> = grid
+            .leaves()
+            .iter()
+            .copied()
+            .zip(felt)
+            .map(|(id, felt)| (id, felt.rates))
+            .filter(|(_, r)| !r.is_empty())
+            .collect();
+        self.moved.extend(rates.iter().map(|(id, _)| grid.origin(*id)));
+        self.drawn = Some(rates.iter().flat_map(|(id, _)| leaves_around(grid.origin(*id))).collect());
+        let largest = COURANT * level_set.voxel_size() / f64::from(fastest);
+        Some((rates, largest.min(if left.is_finite() { LONGEST_TIMED } else { LONGEST_STEP }).min(left)))
     }
+}
 
-    fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
-        let voxel_size = tracker.voxel_size();
-        let step = MorphStep { speed: &self.speed, form: MorphSpeed::Upwind, dt: dt as f32, voxel_size };
-        tracker.integrate(&FirstOrder(step), TimeIntegrator::TvdRk1, Target::Moving)
+/// Godunov's first-order |∇φ| for a surface of this speed.
+fn upwind_gradient(sampler: &mut Sampler, ijk: IVec3, voxel_size: f64, speed: f32) -> f32 {
+    let centre = sampler.voxel(ijk);
+    let sign = speed.signum();
+    let mut squared = 0.0;
+    for axis in [IVec3::X, IVec3::Y, IVec3::Z] {
+        let before = (centre - sampler.voxel(ijk - axis)) * sign;
+        let after = (sampler.voxel(ijk + axis) - centre) * sign;
+        let slope = before.max(0.0).max(-after.min(0.0));
+        squared += slope * slope;
     }
+    squared.sqrt() / voxel_size as f32
 }
 
 #[cfg(test)]
@@ -473,7 +442,6 @@ mod tests {
     use crate::grid::Transform;
     use crate::levelset::testing::box_distance;
     use crate::mesh::Bvh;
-    use crate::stencil::upwind::UpwindScheme;
 
     struct Points(Bvh);
 
@@ -500,12 +468,6 @@ mod tests {
         points((0..169).map(|i| DVec3::new(f64::from(i / 13 - 6), f64::from(i % 13 - 6), z)))
     }
 
-    const SOLVER: SolverOptions = SolverOptions {
-        scheme: UpwindScheme::HjWeno5,
-        integrator: TimeIntegrator::TvdRk3,
-        ..SolverOptions::FIRST_ORDER
-    };
-
     /// The limits of the paper alone.
     fn paper() -> Attraction {
         Attraction { tip: 0.0, ..Attraction::default() }
@@ -513,7 +475,9 @@ mod tests {
 
     fn drawn(target: &Points, how: &Attraction, until: Until) -> (LevelSet, AttractionReport) {
         let mut level_set = ground();
-        let report = attract(&mut level_set, target, how, None, until, &SOLVER, &RunOptions::default()).unwrap();
+        let run = RunOptions::default();
+        let within = drawn_within(&level_set, target, how, None, &run).unwrap().unwrap();
+        let report = attract(&mut level_set, target, how, None, within, until, &run).unwrap();
         assert_eq!(level_set.check(), []);
         (level_set, report)
     }
@@ -530,17 +494,17 @@ mod tests {
 
     #[test]
     fn a_sheet_of_points_draws_a_plateau() {
-        // A dense reference in f64: 2.566, 3.816, 3.992; linear theory 4(1 − e^(−t)): 2.528, 3.801, 3.990. Steps of a tenth of the time
-        // are up to 0.05 ahead of it.
+        // A dense reference in f64: 2.566, 3.816, 3.992; linear theory 4(1 − e^(−t)): 2.528, 3.801, 3.990. Steps of a twentieth
+        // are up to 0.03 ahead of it.
         for (t, expected) in [(1.0, 2.566), (3.0, 3.816), (6.0, 3.992)] {
             let (level_set, report) = drawn(&sheet(4.0), &paper(), Until::Time(t));
             let z = height(&level_set, 0.0, 0.0);
             assert!((z - expected).abs() < 0.06 && report.flow.time <= t, "{t} {z}");
             if t == 6.0 {
-                // The last points are at 6: there the reference has 3 and 1 beside it, one voxel less is within its own cells.
+                // The last points are at 6: there the reference has 3, since it reads normals at voxels; here they are reached. Beside it both have 1.
                 let [at6, at7, at9] = [6.0, 7.0, 9.0].map(|x| height(&level_set, x, 0.0));
                 assert!(
-                    (2.0..3.5).contains(&at6) && (0.5..2.0).contains(&at7) && at9.abs() < 0.05,
+                    (2.0..4.05).contains(&at6) && (0.5..2.0).contains(&at7) && at9.abs() < 0.05,
                     "{at6} {at7} {at9}"
                 );
             }
@@ -586,15 +550,14 @@ mod tests {
         assert!((apex - 6.0).abs() < REACHED + 0.05 && report.gap < REACHED && !report.stalled, "{apex} {report:?}");
         // A cone, without a bulb at its tip.
         let mut sampler = level_set.sampler();
-        for (r, z) in [(3.0, 5.0), (3.0, 6.0), (4.0, 3.0)] {
+        for (r, z) in [(4.0, 5.0), (4.0, 6.0), (5.0, 3.0)] {
             assert!(sampler.trilinear(DVec3::new(r, 0.0, z)) > 0.0, "{r} {z}");
         }
     }
 
     #[test]
-    fn what_is_far_keeps_its_bits_and_threads_change_none() {
+    fn threads_and_instructions_change_no_bit() {
         use crate::stencil::simd::{Isa, choose};
-        let before = ground();
         let target = points([DVec3::new(5.0, 4.0, 3.0), DVec3::new(7.0, 4.0, 3.0)]);
         let on = |threads, isa| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -607,15 +570,6 @@ mod tests {
             let grid = level_set.grid();
             grid.leaves().iter().map(|&id| (grid.origin(id), grid.values(id).0.map(f32::to_bits))).collect::<Vec<_>>()
         };
-        let after = on(1, Isa::Portable);
-        assert!(bits(&after) == bits(&on(3, Isa::Avx2)));
-        for &id in before.grid().leaves() {
-            for offset in before.grid().mask(id).iter() {
-                let ijk = before.grid().origin(id) + offset_to_local(offset);
-                if ijk.x < -14 || ijk.y < -14 || ijk.z < -14 {
-                    assert_eq!(after.grid().voxel(ijk), before.grid().voxel(ijk));
-                }
-            }
-        }
+        assert!(bits(&on(1, Isa::Portable)) == bits(&on(3, Isa::Avx2)));
     }
 }

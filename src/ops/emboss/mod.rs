@@ -25,13 +25,18 @@ use self::picture::Picture;
 use self::stamp::{Motif, Stamp};
 pub(super) use self::targets::read_polylines;
 use self::targets::{Elements, Solid, Surface};
+use super::confine::{cut_out, put_back};
 use super::params::{Vector, VoxelLength, WorldLength};
 use super::registry::{Arity, Operator, Outcome, Summary};
 use super::solver::{EvolutionOptions, evolved};
 use crate::error::{EditError, Result};
+use crate::grid::LEAF_DIM;
 use crate::levelset::LevelSet;
 use crate::mesh::Bvh;
-use crate::pde::{Attraction, AttractionReport, CutOff, REACHED, SolverOptions, TimeIntegrator, UpwindScheme, attract};
+use crate::pde::{
+    Attraction, AttractionReport, Attractor, CutOff, REACHED, Report, SolverOptions, StopReason, attract, drawn_within,
+    leaves_around,
+};
 use crate::region::Region;
 use crate::run::RunOptions;
 
@@ -122,11 +127,6 @@ impl Default for Emboss {
         }
     }
 }
-
-/// φ(p) is read from the field after every step: it has to be a distance then, which a step of RK3 restores as far as three of Euler. Those
-/// leave pits behind after hundreds of steps: WENO5 with Euler steps is unstable.
-const SOLVER: SolverOptions =
-    SolverOptions { scheme: UpwindScheme::HjWeno5, integrator: TimeIntegrator::TvdRk3, ..SolverOptions::FIRST_ORDER };
 
 /// Most steps where nothing is asked for: the approach to the limit is algebraic, not exponential.
 const MOST_ITERATIONS: u32 = 1000;
@@ -390,6 +390,10 @@ impl Operator for Emboss {
             }
             _ => {}
         }
+        if self.evolution.solver(SolverOptions::FIRST_ORDER) != SolverOptions::FIRST_ORDER {
+            let accepted = "nothing: attraction has a scheme of its own, and stamps do not flow";
+            return refuse("scheme", "options of the solver".into(), accepted);
+        }
         self.evolution.validate(Self::NAME)
     }
 
@@ -420,11 +424,10 @@ impl Operator for Emboss {
         let mut drawn = None;
         let mut outcome = evolved(level_set, run, |level_set| {
             let how = self.attraction(level_set)?;
-            let (region, until, solver) =
-                (region.as_deref(), self.evolution.until_rest(MOST_ITERATIONS), self.evolution.solver(SOLVER));
+            let region = region.as_deref();
             let report = match source {
-                Source::Solid(_) => attract(level_set, &Solid::new(&tree), &how, region, until, &solver, run)?,
-                _ => attract(level_set, &Surface(&tree), &how, region, until, &solver, run)?,
+                Source::Solid(_) => self.flow(level_set, &Solid::new(&tree), &how, region, run)?,
+                _ => self.flow(level_set, &Surface(&tree), &how, region, run)?,
             };
             drawn = Some(report.clone());
             Ok(report.flow)
@@ -437,6 +440,37 @@ impl Operator for Emboss {
 }
 
 impl Emboss {
+    /// Draws the part of the level set that is to move, and puts back the leaves that did.
+    fn flow(
+        &self,
+        level_set: &mut LevelSet,
+        target: &dyn Attractor,
+        how: &Attraction,
+        region: Option<&dyn Region>,
+        run: &RunOptions,
+    ) -> Result<AttractionReport> {
+        let Some(within) = drawn_within(level_set, target, how, region, run)? else {
+            let voxels = level_set.grid().active_voxels();
+            let flow = Report { steps: 0, time: 0.0, voxels, stopped: StopReason::AtRest };
+            return Ok(AttractionReport { flow, gap: 0.0, stalled: false, moved: Default::default() });
+        };
+        // The band of what moved reaches into so many leaves around it.
+        let half_width = f64::from(level_set.half_width());
+        let rings = ((half_width + 1.0) / f64::from(LEAF_DIM)).ceil();
+        let margin = f64::from(LEAF_DIM) * (rings + 1.0) + 2.0 * half_width + 4.0;
+        let mut part = cut_out(level_set, within, margin, run)?;
+        let until = self.evolution.until_rest(MOST_ITERATIONS);
+        let report = attract(&mut part, target, how, region, within, until, run)?;
+        let mut leaves = report.moved.clone();
+        for _ in 0..rings as u32 {
+            leaves = leaves.into_iter().flat_map(leaves_around).collect();
+        }
+        if !leaves.is_empty() {
+            *level_set = put_back(level_set, &part, leaves, region);
+        }
+        Ok(report)
+    }
+
     /// What the flow reached.
     fn tell(&self, outcome: &mut Outcome, report: &AttractionReport, points: &[DVec3], region: Option<&dyn Region>) {
         let Outcome { level_set, summary } = outcome;

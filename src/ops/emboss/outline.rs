@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use glam::{DVec2, DVec3};
-use kurbo::{Affine, BezPath, PathEl, Shape as _, Stroke, StrokeOpts};
+use kurbo::{Affine, BezPath, Cap, Join, PathEl, Shape as _, Stroke, StrokeOpts};
 use ttf_parser::{Face, GlyphId, OutlineBuilder};
 use usvg::tiny_skia_path::PathSegment;
 
@@ -62,7 +62,7 @@ impl Drawing {
                     }
                     if let Some(stroke) = path.stroke() {
                         let width = f64::from(stroke.width().get());
-                        let style = Stroke::new(width);
+                        let style = stroke_style(stroke);
                         let outline = kurbo::stroke(curve, &style, &StrokeOpts::default(), width / 100.0);
                         self.paths.push((place * outline, Fill::NonZero));
                     }
@@ -166,6 +166,22 @@ impl Drawing {
         }
         Ok(Outline::new(segments))
     }
+}
+
+/// How wide a stroke is drawn, with its ends and corners; dashes are drawn through.
+fn stroke_style(stroke: &usvg::Stroke) -> Stroke {
+    let caps = match stroke.linecap() {
+        usvg::LineCap::Butt => Cap::Butt,
+        usvg::LineCap::Round => Cap::Round,
+        usvg::LineCap::Square => Cap::Square,
+    };
+    let join = match stroke.linejoin() {
+        usvg::LineJoin::Miter | usvg::LineJoin::MiterClip => Join::Miter,
+        usvg::LineJoin::Round => Join::Round,
+        usvg::LineJoin::Bevel => Join::Bevel,
+    };
+    let limit = f64::from(stroke.miterlimit().get());
+    Stroke::new(f64::from(stroke.width().get())).with_caps(caps).with_join(join).with_miter_limit(limit)
 }
 
 fn path_of(segments: impl Iterator<Item = PathSegment>) -> BezPath {
