@@ -225,6 +225,8 @@ mod tests {
             ("capsule a=0,0,0 b=0,1,0 radius=0.4", 4.0 / 3.0 * PI * 0.064 + PI * 0.16),
             ("superellipsoid radii=1,0.8,0.6", 4.0 / 3.0 * PI * 0.48),
             ("supertoroid radii=0.3,0.3,0.3 alpha=3.3333333333", 2.0 * PI * PI * 0.09),
+            // Nearly an elliptic column: its value along a ray is far more than the distance.
+            ("superellipsoid radii=0.32,0.15,1.1", 4.0 / 3.0 * PI * 0.32 * 0.15 * 1.1),
         ] {
             let level_set = make(spec, 0.02);
             assert!(level_set.check().is_empty(), "{spec}: {:?}", level_set.check());
