@@ -105,7 +105,9 @@ fn color(text: &str) -> Result<Color, String> {
         _ => match text.strip_prefix("difference:") {
             Some(other) if !other.is_empty() => Color::Difference(other.into()),
             _ => {
-                return Err("there are clay, curvature, normal, component, geodesic, region and difference:OTHER".into());
+                return Err(
+                    "there are clay, curvature, normal, component, geodesic, region and difference:OTHER".into()
+                );
             }
         },
     })
