@@ -62,7 +62,7 @@ const VERBS: &[Verb] = &[
 /// Runs the command with the arguments of the process.
 pub fn main() -> ExitCode {
     report::no_backtraces();
-    let arguments: Vec<OsString> = std::env::args_os().collect();
+    let arguments = args::with_repeated_points(std::env::args_os());
     let matches = match app::command().try_get_matches_from(&arguments) {
         Ok(matches) => matches,
         Err(error) => return report::usage(&error, Format::guess(&arguments)),

@@ -47,7 +47,6 @@ fn build(command: Command) -> Command {
         )
         .arg(
             option("from", "X,Y,Z")
-                .num_args(1..)
                 .action(ArgAction::Append)
                 .allow_hyphen_values(true)
                 .value_parser(ValueParser::new(|text: &str| text.parse::<Vector>()))

@@ -465,8 +465,10 @@ mod tests {
             for at in grid.mask(id).iter().step_by(7) {
                 let ijk = grid.origin(id) + offset_to_local(at);
                 let least = fields[0].field.accessor().value(ijk).min(fields[1].field.accessor().value(ijk));
+                let apart = (fields[0].field.accessor().value(ijk) - fields[1].field.accessor().value(ijk)).abs();
                 // Where both are as near, the mean of neighbours in one field is less than that in each of the two.
-                assert!((grid.values(id).0[at] - least).abs() < 0.6, "{ijk}");
+                let tolerance = if apart > 4.0 { 0.3 } else { 1.0 };
+                assert!((grid.values(id).0[at] - least).abs() < tolerance, "{ijk}");
             }
         }
     }

@@ -410,13 +410,11 @@ mod tests {
             }
             assert!(moved > 100, "the edge is rounded: {moved}");
             let mut again = twice.sampler();
-            // Within a tenth of a voxel on the mean, but for the rim: between the two steps it is sharp, and the polygons cut it.
+            // Between the two steps the rim is sharp, and the polygons cut it.
             let beside: Vec<_> = once.band_voxels().into_iter().filter(|(_, value)| value.abs() < 0.5).collect();
             let difference = |(ijk, value): &(IVec3, f32)| f64::from(again.voxel(*ijk) - value).abs() / 0.5;
-            let differences: Vec<f64> = beside.iter().map(difference).collect();
-            let mean = differences.iter().sum::<f64>() / differences.len() as f64;
-            let most = differences.into_iter().fold(0.0, f64::max);
-            assert!(mean < 0.05 && most < 0.5, "{open}: {mean} {most}");
+            let most = beside.iter().map(difference).fold(0.0, f64::max);
+            assert!(most < 0.2, "{open}: {most}");
         }
     }
 
