@@ -26,7 +26,6 @@ mod signal;
 mod size;
 mod table;
 
-use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::{ArgMatches, Command};

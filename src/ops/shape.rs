@@ -242,7 +242,11 @@ mod tests {
         let measured = level_set.measure(&RunOptions::default()).unwrap();
         assert_eq!((measured.components, measured.euler), (1, 2));
         // A little less than the column of the same height.
-        assert!((0.95..1.0).contains(&(measured.volume / (PI * 0.32 * 0.15 * 2.2))), "{}", measured.volume);
+        assert!(
+            (0.95..1.0).contains(&(measured.volume / (std::f64::consts::PI * 0.32 * 0.15 * 2.2))),
+            "{}",
+            measured.volume
+        );
     }
 
     #[test]
