@@ -18,6 +18,7 @@ use crate::error::Result;
 use crate::grid::{Grid, LEAF_VOXELS, LeafId, LeafMask, LeafSet, leaf_offset, leaf_origin, offset_to_local};
 use crate::levelset::LevelSet;
 use crate::mesh::{Rebuild, rebuild, with_half_width};
+use crate::pde::Report;
 use crate::region::{Region, RegionWeights};
 use crate::run::RunOptions;
 
@@ -92,6 +93,22 @@ pub(super) fn kept(original: &LevelSet, mut edited: LevelSet, region: &dyn Regio
     merge.cut_to_kept(&mut edited, &mut changed);
     edited.grid_mut().prune(&changed);
     edited
+}
+
+/// Moves a level set by a flow that weighs its region itself; in a region, with the field beside voxels that stay cut as [`kept`] does.
+/// For flows that may pile material up at the region's rim, which renormalisation cannot repair against voxels that must not change.
+pub(super) fn held(
+    level_set: &mut LevelSet,
+    region: Option<&dyn Region>,
+    flow: impl FnOnce(&mut LevelSet) -> Result<Report>,
+) -> Result<Report> {
+    let Some(region) = region else { return flow(level_set) };
+    let original = level_set.clone();
+    let report = flow(level_set)?;
+    let nothing = LevelSet::empty(*original.transform(), original.half_width());
+    let moved = std::mem::replace(level_set, nothing);
+    *level_set = if report.steps == 0 { moved } else { kept(&original, moved, region) };
+    Ok(report)
 }
 
 /// φ ← (1 − α) φ + α φ_new where α > 0.
