@@ -365,7 +365,7 @@ fn scans_become_level_sets() {
     assert!(found["warnings"][0].as_str().unwrap().contains("resampled"), "{found}");
     assert_eq!(found["voxel_size"], 0.5);
     let segmented =
-        desk.done(&["segment", "scan.nrrd", "-o", "b.ply", "--iso", "50", "--smoothness", "0.1", "--json"]).json();
+        desk.done(&["segment", "scan.nrrd", "-o", "b.ply", "--iso", "50", "--smoothness", "0.02", "--json"]).json();
     assert!((segmented["volume_after"].as_f64().unwrap() / volume - 1.0).abs() < 0.03, "{segmented}");
     let hollow = desk.done(&["convert", "scan.nrrd", "-o", "c.vdb", "--iso", "50", "--invert", "--json"]).json();
     assert!(hollow["volume_after"].as_f64().unwrap() > 2.0 * volume);

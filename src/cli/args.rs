@@ -1,5 +1,6 @@
 //! Options that many commands share.
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 
 use clap::builder::ValueParser;
@@ -8,6 +9,7 @@ use clap::{Arg, ArgAction, ArgMatches, Command, ValueEnum, ValueHint, value_pars
 use super::progress::When;
 use super::report::Format;
 use super::{options, size};
+use crate::ops::Vector;
 use crate::stencil::simd::Isa;
 
 /// Headings of the help.
@@ -201,4 +203,37 @@ pub fn flag(matches: &ArgMatches, id: &str) -> bool {
 /// The files of an argument.
 pub fn paths(matches: &ArgMatches, id: &str) -> Vec<PathBuf> {
     matches.try_get_many::<PathBuf>(id).ok().flatten().map(|paths| paths.cloned().collect()).unwrap_or_default()
+}
+
+/// The arguments with `--from A B C` spelled `--from A --from B --from C`: an option that takes any number of values which may begin with a
+/// minus would take the options after it as well.
+pub fn with_repeated_points(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
+    const OPTION: &str = "--from";
+    let is_point = |text: &OsString| text.to_str().is_some_and(|text| text.parse::<Vector>().is_ok());
+    let mut spelled: Vec<OsString> = Vec::new();
+    let mut points = 0;
+    for argument in arguments {
+        points = match (argument == OPTION, points > 0 && is_point(&argument)) {
+            (true, _) => 1,
+            (_, true) => points + 1,
+            _ => 0,
+        };
+        if points > 2 {
+            spelled.push(OPTION.into());
+        }
+        spelled.push(argument);
+    }
+    spelled
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn several_points_behind_one_option() {
+        let spelled = |line: &str| with_repeated_points(line.split(' ').map(OsString::from)).join(" ".as_ref());
+        assert_eq!(spelled("g --from 0,0,1 -1,0,0 2,2,2 -o f"), "g --from 0,0,1 --from -1,0,0 --from 2,2,2 -o f");
+        assert_eq!(spelled("g --from 0,0,1 --from -1,0,0 x 1,1,1"), "g --from 0,0,1 --from -1,0,0 x 1,1,1");
+    }
 }

@@ -43,15 +43,6 @@ fn build(command: Command) -> Command {
                 .allow_hyphen_values(true)
                 .value_parser(ValueParser::new(|text: &str| text.parse::<Vector>()))
                 .help("A point on the surface or within the band around it; of several, one behind the other, the nearest counts"),
-        )
-        .arg(
-            // An option that takes any number of values which may begin with a minus would take the options after it as well.
-            Arg::new("more")
-                .num_args(0..)
-                .hide(true)
-                .help("Further points")
-                .allow_hyphen_values(true)
-                .value_parser(ValueParser::new(|text: &str| text.parse::<Vector>())),
         );
     let command = args::output(args::conversion(args::grids(command), |_| false));
     OF_LEVEL_SETS.iter().fold(command, |command, id| command.mut_arg(id, |arg| arg.hide(true)))
@@ -70,8 +61,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         return Err(EditError::parameter(VERB.name, id, "given", accepted));
     }
     let output = files::output(matches, context)?;
-    let points = |id| matches.get_many::<Vector>(id).into_iter().flatten().map(|v| v.0);
-    let from: Vec<DVec3> = points("from").chain(points("more")).collect();
+    let from: Vec<DVec3> = matches.get_many::<Vector>("from").into_iter().flatten().map(|v| v.0).collect();
     if args::flag(matches, "dry-run") {
         let values =
             Map::from_iter([("from".to_owned(), json!(from.iter().map(|p| p.to_array()).collect::<Vec<_>>()))]);

@@ -26,7 +26,6 @@ mod signal;
 mod size;
 mod table;
 
-use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::{ArgMatches, Command};
@@ -62,7 +61,7 @@ const VERBS: &[Verb] = &[
 /// Runs the command with the arguments of the process.
 pub fn main() -> ExitCode {
     report::no_backtraces();
-    let arguments: Vec<OsString> = std::env::args_os().collect();
+    let arguments = args::with_repeated_points(std::env::args_os());
     let matches = match app::command().try_get_matches_from(&arguments) {
         Ok(matches) => matches,
         Err(error) => return report::usage(&error, Format::guess(&arguments)),

@@ -47,7 +47,6 @@ fn build(command: Command) -> Command {
         )
         .arg(
             option("from", "X,Y,Z")
-                .num_args(1..)
                 .action(ArgAction::Append)
                 .allow_hyphen_values(true)
                 .value_parser(ValueParser::new(|text: &str| text.parse::<Vector>()))
@@ -105,7 +104,9 @@ fn color(text: &str) -> Result<Color, String> {
         _ => match text.strip_prefix("difference:") {
             Some(other) if !other.is_empty() => Color::Difference(other.into()),
             _ => {
-                return Err("there are clay, curvature, normal, component, geodesic, region and difference:OTHER".into());
+                return Err(
+                    "there are clay, curvature, normal, component, geodesic, region and difference:OTHER".into()
+                );
             }
         },
     })

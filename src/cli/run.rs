@@ -123,9 +123,16 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         if let (Some(seen), Some(before)) = (seen.first_mut(), before.first()) {
             *seen = *before;
         }
-        while stamps(&watched) == seen {
+        // A file that is being written is not yet what is meant: until nothing changes any more.
+        let mut last = stamps(&watched);
+        loop {
             context.run.check("watching")?;
             std::thread::sleep(POLL);
+            let now = stamps(&watched);
+            if now == last && now != seen {
+                break;
+            }
+            last = now;
         }
     }
 }

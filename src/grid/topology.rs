@@ -286,7 +286,7 @@ impl Topology {
             let first = entry_of_leaf(local - 1);
             let mut around = [LeafId::OUTSIDE; 27];
             for (run, entries) in around.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                entries.copy_from_slice(&table[first + (run / 3 << 8) + (run % 3 << 4)..][..3]);
+                entries.copy_from_slice(&table[first + ((run / 3) << 8) + ((run % 3) << 4)..][..3]);
             }
             return around;
         }

@@ -125,16 +125,22 @@ impl Solid {
                 (p - axis * t).length() - radius
             }
             Form::Superellipsoid { radii, exponents: [e1, e2] } => {
-                // s − 1 with the homogeneous s of Barr 1981, times the length of a unit of s along the ray.
+                // s − 1 with the homogeneous s of Barr 1981, whose slope is at most `steepness` over the smallest radius: never
+                // more than the distance, however long the solid is.
                 let s = lp(lp(q.x / radii.x, q.y / radii.y, e2), q.z / radii.z, e1);
-                (s - 1.0) * if s > 0.0 { (q.length() / s).max(radii.min_element()) } else { radii.min_element() }
+                (s - 1.0) * radii.min_element() / steepness([e1, e2])
             }
             Form::Supertoroid { radii, alpha, exponents: [e1, e2] } => {
                 let ring = lp(q.x / radii.x, q.y / radii.y, e2) - alpha;
-                (lp(ring, q.z / radii.z, e1) - 1.0) * radii.min_element()
+                (lp(ring, q.z / radii.z, e1) - 1.0) * radii.min_element() / steepness([e1, e2])
             }
         }
     }
+}
+
+/// Largest slope of two nested [`lp`]: 1 for exponents up to 1, up to √2 each above, where edges point outwards.
+fn steepness(exponents: [f64; 2]) -> f64 {
+    exponents.iter().map(|e| if *e > 1.0 { std::f64::consts::SQRT_2 } else { 1.0 }).product()
 }
 
 /// (|a|^(2/e) + |b|^(2/e))^(e/2), with the larger part taken out so that no power overflows.
@@ -165,7 +171,7 @@ mod tests {
             ("cylinder radius=1 height=4 axis=x", [0.0, 0.25, 0.0], -0.75),
             ("capsule a=0,0,0 b=0,0,5 radius=1", [0.0, 3.0, 2.0], 2.0),
             ("superellipsoid radii=3,2,1", [3.0, 0.0, 0.0], 0.0),
-            ("superellipsoid radii=3,2,1 exponents=0.2,0.2", [3.3, 0.0, 0.0], 0.3),
+            ("superellipsoid radii=3,2,1 exponents=0.2,0.2", [3.3, 0.0, 0.0], 0.1),
             ("supertoroid radii=1,1,1 alpha=3", [4.0, 0.0, 0.0], 0.0),
         ] {
             assert!((value(text, p) - d).abs() < 1e-12, "{text} {p:?}: {}", value(text, p));

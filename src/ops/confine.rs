@@ -20,6 +20,7 @@ use crate::grid::{
 };
 use crate::levelset::LevelSet;
 use crate::mesh::{Rebuild, rebuild, with_half_width};
+use crate::pde::Report;
 use crate::region::{Region, RegionWeights};
 use crate::run::RunOptions;
 
@@ -143,7 +144,7 @@ impl Region for Leaves<'_> {
         let corners = self
             .leaves
             .iter()
-            .flat_map(|o| (0..8).map(|c| IVec3::new(c >> 2 & 1, c >> 1 & 1, c & 1) * (LEAF_DIM - 1) + *o));
+            .flat_map(|o| (0..8).map(|c| IVec3::new((c >> 2) & 1, (c >> 1) & 1, c & 1) * (LEAF_DIM - 1) + *o));
         let world = corners.map(|ijk| self.transform.voxel_to_world(ijk));
         Some(world.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), p| (lo.min(p), hi.max(p))))
     }
@@ -155,6 +156,22 @@ impl Region for Leaves<'_> {
             false => [0.0; 2],
         }
     }
+}
+
+/// Moves a level set by a flow that weighs its region itself; in a region, with the field beside voxels that stay cut as [`kept`] does.
+/// For flows that may pile material up at the region's rim, which renormalisation cannot repair against voxels that must not change.
+pub(super) fn held(
+    level_set: &mut LevelSet,
+    region: Option<&dyn Region>,
+    flow: impl FnOnce(&mut LevelSet) -> Result<Report>,
+) -> Result<Report> {
+    let Some(region) = region else { return flow(level_set) };
+    let original = level_set.clone();
+    let report = flow(level_set)?;
+    let nothing = LevelSet::empty(*original.transform(), original.half_width());
+    let moved = std::mem::replace(level_set, nothing);
+    *level_set = if report.steps == 0 { moved } else { kept(&original, moved, region) };
+    Ok(report)
 }
 
 /// φ ← (1 − α) φ + α φ_new where α > 0.

@@ -13,6 +13,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::confine::held;
 use super::csg::{CsgOperation, csg};
 use super::curvature::{CurvatureOptions, unresolved};
 use super::params::WorldLength;
@@ -126,5 +127,6 @@ pub fn fillet(level_set: &mut LevelSet, params: &Fillet, run: &RunOptions) -> Re
         Some([least, _]) => params.evolution.until_rest((STEPS / least / least).min(MOST_STEPS) as u32),
         None => params.evolution.until(),
     };
-    flow.evolve(level_set, region.as_deref(), until, &params.evolution.solver(SMOOTHING), run)
+    let (region, solver) = (region.as_deref(), params.evolution.solver(SMOOTHING));
+    held(level_set, region, |moved| flow.evolve(moved, region, until, &solver, run))
 }

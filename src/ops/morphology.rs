@@ -410,13 +410,11 @@ mod tests {
             }
             assert!(moved > 100, "the edge is rounded: {moved}");
             let mut again = twice.sampler();
-            // Within a tenth of a voxel, but for the rim: between the two steps it is sharp, and the polygons cut it.
+            // Between the two steps the rim is sharp, and the polygons cut it.
             let beside: Vec<_> = once.band_voxels().into_iter().filter(|(_, value)| value.abs() < 0.5).collect();
             let difference = |(ijk, value): &(IVec3, f32)| f64::from(again.voxel(*ijk) - value).abs() / 0.5;
-            let mut differences: Vec<f64> = beside.iter().map(difference).collect();
-            differences.sort_by(f64::total_cmp);
-            let (most, nearly_all) = (differences[differences.len() - 1], differences[differences.len() * 97 / 100]);
-            assert!(nearly_all < 0.1 && most < 0.5, "{open}: {nearly_all} {most}");
+            let most = beside.iter().map(difference).fold(0.0, f64::max);
+            assert!(most < 0.2, "{open}: {most}");
         }
     }
 

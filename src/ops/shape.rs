@@ -235,6 +235,21 @@ mod tests {
     }
 
     #[test]
+    fn long_superellipsoids_are_whole() {
+        // Nearly an elliptic column: its value along a ray is far more than the distance.
+        let level_set = make("superellipsoid radii=0.32,0.15,1.1 exponents=0.1,1", 0.02);
+        assert_eq!(level_set.check(), []);
+        let measured = level_set.measure(&RunOptions::default()).unwrap();
+        assert_eq!((measured.components, measured.euler), (1, 2));
+        // A little less than the column of the same height.
+        assert!(
+            (0.95..1.0).contains(&(measured.volume / (std::f64::consts::PI * 0.32 * 0.15 * 2.2))),
+            "{}",
+            measured.volume
+        );
+    }
+
+    #[test]
     fn patches_become_shells_and_solids() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("one patch.bpt");

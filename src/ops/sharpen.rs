@@ -7,6 +7,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::confine::held;
 use super::curvature::{CurvatureOptions, unresolved};
 use super::params::VoxelLength;
 use super::registry::{Arity, Operator, Outcome};
@@ -78,5 +79,6 @@ pub fn sharpen(level_set: &mut LevelSet, params: &Sharpen, run: &RunOptions) -> 
     let reach = params.max_displacement.world(level_set.voxel_size());
     let region = params.evolution.region.on(level_set, run)?;
     let (until, solver) = (params.evolution.until(), params.evolution.solver(SMOOTHING));
-    pde::sharpen(level_set, &params.driven()?, reach, region.as_deref(), until, &solver, run)
+    let (flow, region) = (params.driven()?, region.as_deref());
+    held(level_set, region, |moved| pde::sharpen(moved, &flow, reach, region, until, &solver, run))
 }

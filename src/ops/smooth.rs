@@ -22,6 +22,7 @@ use fearless_simd::Simd;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::confine::held;
 use super::curvature::{CurvatureOptions, unresolved};
 use super::params::words;
 use super::registry::{Arity, Operator, Outcome};
@@ -191,7 +192,12 @@ pub fn smooth(level_set: &mut LevelSet, params: &Smooth, run: &RunOptions) -> Re
     }
     match params.method {
         SmoothMethod::Laplacian => evolve(level_set, &Diffusion, region, until, &solver, run),
-        _ => params.flow.flow(Smooth::NAME, CurvatureFlow::MEAN)?.evolve(level_set, region, until, &solver, run),
+        _ => {
+            let flow = params.flow.flow(Smooth::NAME, CurvatureFlow::MEAN)?;
+            // Uncut mean curvature flow takes no material anywhere that it does not spread.
+            let rim = region.filter(|_| flow != CurvatureFlow::MEAN);
+            held(level_set, rim, |moved| flow.evolve(moved, region, until, &solver, run))
+        }
     }
 }
 

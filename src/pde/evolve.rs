@@ -1,10 +1,11 @@
 //! The time loop.
 
+use super::rest::Watch;
 use super::speed::{FlowStep, SpeedFunction};
 use super::step::Target;
 use super::{SolverOptions, TimeIntegrator, Tracker};
 use crate::error::{EditError, Result};
-use crate::grid::Grid;
+use crate::grid::{Grid, LeafValues};
 use crate::levelset::LevelSet;
 use crate::region::Region;
 use crate::run::RunOptions;
@@ -111,9 +112,19 @@ pub fn evolve(
 ) -> Result<Report> {
     let voxel_size = level_set.voxel_size();
     let start = region.filter(|_| function.needs_hold()).map(|_| level_set.grid().clone());
-    let rest = matches!(until, Until::Rest(_)).then_some(false);
+    let rest = watch(level_set, until, run)?;
     let mut tracker = Tracker::new(level_set, region, *solver, run);
     drive(&mut tracker, &mut Flow { function, voxel_size, start, rest }, until)
+}
+
+/// What watches for rest, if the flow goes on until then.
+pub(super) fn watch(level_set: &LevelSet, until: Until, run: &RunOptions) -> Result<Option<Watch>> {
+    if !matches!(until, Until::Rest(_)) {
+        return Ok(None);
+    }
+    let bytes = level_set.grid().leaves().len() as u64 * size_of::<LeafValues>() as u64;
+    run.reserve("evolve", bytes, "a region or a coarser grid needs less")?;
+    Ok(Some(Watch::new(level_set.grid())))
 }
 
 /// Part of a step by which a time may exceed a whole number of steps without one more.
@@ -125,13 +136,13 @@ struct Flow<'a, F> {
     voxel_size: f64,
     /// The field before, if the flow is held at the rim of its region.
     start: Option<Grid>,
-    /// Whether it has come to rest, if it goes on until then.
-    rest: Option<bool>,
+    /// What watches for rest, if it goes on until then.
+    rest: Option<Watch>,
 }
 
 impl<F: SpeedFunction> Motion for Flow<'_, F> {
-    fn prepare(&mut self, _: &Tracker, left: f64) -> Option<f64> {
-        if self.rest == Some(true) {
+    fn prepare(&mut self, tracker: &Tracker, left: f64) -> Option<f64> {
+        if self.rest.as_mut().is_some_and(|watch| watch.is_rest(tracker)) {
             return None;
         }
         let largest = self.function.largest_step(self.voxel_size);
@@ -149,8 +160,8 @@ impl<F: SpeedFunction> Motion for Flow<'_, F> {
         if let Some(start) = &self.start {
             tracker.hold(start);
         }
-        if let Some(rest) = &mut self.rest {
-            *rest = tracker.last_change().is_rest(dt, self.voxel_size);
+        if let Some(watch) = &mut self.rest {
+            watch.stepped(tracker, dt);
         }
         Ok(())
     }

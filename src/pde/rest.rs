@@ -1,4 +1,7 @@
-//! What long flows in a region need: whether a step still moved the surface, and what holds it at the region's rim.
+//! What flows that go on for long need: whether a step still moved the surface, and what holds it at the region's rim.
+//!
+//! At rest is what no longer moves over [`Watch::STEPS`] steps, renormalisation included: each shifts the surface a little, which the flow takes
+//! back, so that a single Euler step goes on moving a surface that stays where it is.
 //!
 //! A region's weight α slows a flow down. One that goes on long enough ends up as far from where it was at α = 0.01 as at α = 1, and
 //! one-sided flows pile material up against the voxels with α = 0, which stay as they were: a cliff, and no distance. So such
@@ -6,7 +9,8 @@
 //!
 //! > |φ − φ₀| ≤ h α/(1 − α),
 //!
-//! a voxel at α = ½, and no bound in effect from α = 0.9 on.
+//! a voxel at α = ½, and no bound in effect from α = 0.9 on. Where a region fades within two voxels or so that is no bound on the slope of φ:
+//! operators cut what is too steep afterwards (`ops::confine`).
 
 use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 use rayon::prelude::*;
@@ -18,7 +22,7 @@ use crate::stencil::simd::{Lanes, Work, dispatch};
 
 /// The fastest that a resting surface moves, in voxels a unit of time in voxels squared (F = −H moves a ball of 1000 voxels so).
 const SLOWEST: f64 = 1e-3;
-/// The root mean square change of a step, in voxels, that is rest, over the voxels that change at all: however large the
+/// The root mean square change, in voxels, that is rest, of a step or of as many as lie between two looks, over the voxels that change at all: however large the
 /// region, a part of it that still moves is not lost in the mean.
 const SMALLEST: f64 = 1e-4;
 
@@ -40,7 +44,7 @@ pub(super) struct Change {
 const UNIT: f64 = (1u64 << 40) as f64;
 
 impl Change {
-    /// Whether that is rest, of a step of `dt` (world units squared).
+    /// Whether that is rest, of steps that last `dt` (world units squared).
     pub fn is_rest(&self, dt: f64, voxel_size: f64) -> bool {
         let slow = f64::from(self.largest) <= SLOWEST * dt / (voxel_size * voxel_size);
         slow || self.squares as f64 <= SMALLEST * SMALLEST * UNIT * self.voxels as f64
@@ -52,6 +56,41 @@ impl Change {
             squares: self.squares.saturating_add(other.squares),
             voxels: self.voxels + other.voxels,
         }
+    }
+}
+
+/// Watches for rest.
+pub(super) struct Watch {
+    before: Grid,
+    steps: u32,
+    time: f64,
+    rest: bool,
+}
+
+impl Watch {
+    /// Steps between two looks.
+    const STEPS: u32 = 10;
+
+    /// From now on.
+    pub fn new(grid: &Grid) -> Self {
+        Self { before: grid.clone(), steps: 0, time: 0.0, rest: false }
+    }
+
+    /// After an Euler step of `dt`, before the band is tracked.
+    pub fn stepped(&mut self, tracker: &Tracker, dt: f64) {
+        self.rest = tracker.last_change().is_rest(dt, f64::from(tracker.voxel_size()));
+        self.steps += 1;
+        self.time += dt;
+    }
+
+    /// Whether the surface rests; after the band is tracked.
+    pub fn is_rest(&mut self, tracker: &Tracker) -> bool {
+        if self.steps >= Self::STEPS {
+            let change = tracker.change_since(&self.before);
+            self.rest |= change.is_rest(self.time, f64::from(tracker.voxel_size()));
+            (self.before, self.steps, self.time) = (tracker.grid().clone(), 0, 0.0);
+        }
+        self.rest
     }
 }
 
@@ -79,6 +118,25 @@ impl Tracker<'_> {
                 values.0[at] = values.0[at].max(before[at] - reach).min(before[at] + reach);
             }
         });
+    }
+
+    /// What has changed since `before`, of the same level set a few steps ago.
+    pub(super) fn change_since(&self, before: &Grid) -> Change {
+        let (grid, domain, scale) = (&*self.grid, &self.domain, 1.0 / self.voxel_size());
+        let leaves: Vec<_> = domain.leaves().iter().collect();
+        let of_leaf = |&id| {
+            // The slots of a leaf differ once leaves have come and gone.
+            let (now, old) = (&grid.values(id).0, &before.values(before.find(grid.origin(id))).0);
+            let (mut largest, mut sum, mut voxels) = (0.0f32, 0.0, 0);
+            for at in domain.moving(id, grid.mask(id)).iter().filter(|&at| now[at].abs() * scale < 1.0) {
+                let moved = (now[at] - old[at]).abs() * scale;
+                largest = largest.max(moved);
+                sum += f64::from(moved * moved);
+                voxels += u64::from(moved > 0.0);
+            }
+            Change { largest, squares: (sum * UNIT) as u64, voxels }
+        };
+        leaves.par_iter().map(of_leaf).reduce(Change::default, Change::join)
     }
 
     /// What the last Euler step changed, region included; before the band is tracked.

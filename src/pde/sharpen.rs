@@ -20,7 +20,8 @@
 use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 
 use super::curvature_flow::upwind_gradient;
-use super::evolve::{Motion, Until, WHOLE_STEPS, drive};
+use super::evolve::{Motion, Until, WHOLE_STEPS, drive, watch};
+use super::rest::Watch;
 use super::step::{LeafKernel, Rows, Target};
 use super::{CurvatureFlow, Report, SolverOptions, TimeIntegrator, Tracker};
 use crate::error::Result;
@@ -49,8 +50,8 @@ pub fn sharpen(
     let start = level_set.clone();
     let bytes = start.grid().leaves().len() as u64 * size_of::<LeafValues>() as u64;
     run.reserve("sharpen", 2 * bytes, "a region or a coarser grid needs less")?;
+    let rest = watch(level_set, until, run)?;
     let mut tracker = Tracker::new(level_set, region, *solver, run);
-    let rest = matches!(until, Until::Rest(_)).then_some(false);
     let mut motion = Sharpening { flow, start: start.grid(), reach: reach as f32, rest, curvature: Paged::default() };
     drive(&mut tracker, &mut motion, until)
 }
@@ -62,15 +63,15 @@ struct Sharpening<'a> {
     flow: &'a CurvatureFlow,
     start: &'a Grid,
     reach: f32,
-    /// Whether it has come to rest, if it goes on until then.
-    rest: Option<bool>,
+    /// What watches for rest, if it goes on until then.
+    rest: Option<Watch>,
     /// k at the active voxels of the domain's leaves, in 1/world; `UNKNOWN` elsewhere.
     curvature: Paged<LeafValues>,
 }
 
 impl Motion for Sharpening<'_> {
     fn prepare(&mut self, tracker: &Tracker, left: f64) -> Option<f64> {
-        if self.rest == Some(true) {
+        if self.rest.as_mut().is_some_and(|watch| watch.is_rest(tracker)) {
             return None;
         }
         let pages = tracker.grid().value_pages().page_count();
@@ -91,8 +92,8 @@ impl Motion for Sharpening<'_> {
         let Self { flow, start, reach, ref curvature, .. } = *self;
         let kernel = Sharpen { flow, start, reach, curvature, dt: dt as f32, voxel_size: tracker.voxel_size() };
         tracker.integrate(&kernel, TimeIntegrator::TvdRk1, Target::Moving)?;
-        if let Some(rest) = &mut self.rest {
-            *rest = tracker.last_change().is_rest(dt, f64::from(tracker.voxel_size()));
+        if let Some(watch) = &mut self.rest {
+            watch.stepped(tracker, dt);
         }
         Ok(())
     }

@@ -372,7 +372,11 @@ fn shapes_are_preserved_where_noise_goes() {
         assert!((found_face - face).abs() < 0.04, "{critical:?} {times}: faces {found_face}");
         // There the edges start at 0.166.
         let (retreat, stated) = (found_edge - start, edge - 0.166);
-        assert!((retreat - stated).abs() < 0.3, "{critical:?} {times}: edges {retreat}, {stated}");
+        // The edge of one noise retreats by some 15 % more or less than that of another.
+        assert!(
+            (retreat - stated).abs() < 0.3f64.max(0.15 * stated),
+            "{critical:?} {times}: edges {retreat}, {stated}"
+        );
     }
 }
 
