@@ -39,7 +39,7 @@ fn operators() -> impl Iterator<Item = &'static Entry> {
     REGISTRY.iter().filter(move |entry| velocities || entry.name != "advect")
 }
 
-/// A grid of vectors: 0, −15, 0 between 0 and 4 along each axis.
+/// A grid of vectors: 0, −15, 0 between −2 and 2 along each axis.
 fn velocity() -> String {
     common::shared("vdb").map(|folder| folder.join("velocity_vec3s.vdb").display().to_string()).unwrap_or_default()
 }

@@ -126,7 +126,7 @@ const MARGIN: f64 = 6.0;
 pub type IndexBounds = (DVec3, DVec3);
 
 /// Draws a level set to `target`, where `region` lets it and `within` a box (that of [`drawn_within`]), until every point that draws is reached
-/// (within [`REACHED`]), nothing comes nearer, or `until`. The time unit is that in which a gap falls to 1/e.
+/// (well within [`REACHED`]), nothing comes nearer, or `until`. The time unit is that in which a gap falls to 1/e.
 ///
 /// The whole band is rebuilt if anything moves; the report says in which leaves something did.
 pub fn attract(
