@@ -1,10 +1,10 @@
 //! The time loop.
 
+use super::rest::Watch;
 use super::speed::{FlowStep, SpeedFunction};
 use super::step::Target;
 use super::{SolverOptions, TimeIntegrator, Tracker};
 use crate::error::{EditError, Result};
-use super::rest::Watch;
 use crate::grid::{Grid, LeafValues};
 use crate::levelset::LevelSet;
 use crate::region::Region;
