@@ -82,6 +82,7 @@ pub mod render;
 pub mod run;
 pub mod spec;
 pub mod stencil;
+pub mod texture;
 #[cfg(feature = "openvdb")]
 pub mod vdb;
 

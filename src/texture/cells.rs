@@ -1,0 +1,271 @@
+//! The cells of a patch volume: the exact inverse of its map, folds, and distortion.
+
+use glam::{DMat3, DVec3, IVec3};
+use rustc_hash::FxHashMap;
+use smallvec::SmallVec;
+
+use super::volume::Volume;
+
+/// Newton steps for the place in a cell, and how near they end, in voxels.
+const STEPS: usize = 12;
+const NEAR_ENOUGH: f64 = 1e-6;
+
+/// How far outside a cell, in its own coordinates, a place still counts as in it: cells share their faces.
+const SLACK: f64 = 1e-6;
+
+/// A cell on which the map is trilinear.
+#[derive(Clone, Debug)]
+struct Cell {
+    low: DVec3,
+    high: DVec3,
+    /// Corner x·4 + y·2 + z in (u, v, w).
+    corners: [DVec3; 8],
+}
+
+impl Cell {
+    /// The place at `t` in 0..1³, and the derivatives by t.
+    fn at(&self, t: DVec3) -> (DVec3, DMat3) {
+        let c = &self.corners;
+        let along_w: [DVec3; 4] = std::array::from_fn(|i| c[2 * i].lerp(c[2 * i + 1], t.z));
+        let by_w: [DVec3; 4] = std::array::from_fn(|i| c[2 * i + 1] - c[2 * i]);
+        let (low, high) = (along_w[0].lerp(along_w[1], t.y), along_w[2].lerp(along_w[3], t.y));
+        let by_v = (along_w[1] - along_w[0]).lerp(along_w[3] - along_w[2], t.x);
+        let by_w = by_w[0].lerp(by_w[1], t.y).lerp(by_w[2].lerp(by_w[3], t.y), t.x);
+        (low.lerp(high, t.x), DMat3::from_cols(high - low, by_v, by_w))
+    }
+
+    /// Where `x` is in the cell, by Newton's iteration from the middle; `None` outside.
+    fn find(&self, x: DVec3) -> Option<DVec3> {
+        let mut t = DVec3::splat(0.5);
+        for _ in 0..STEPS {
+            let (p, derivative) = self.at(t);
+            let off = x - p;
+            if off.length() < NEAR_ENOUGH {
+                let inside = t.cmpge(DVec3::splat(-SLACK)).all() && t.cmple(DVec3::splat(1.0 + SLACK)).all();
+                return inside.then(|| t.clamp(DVec3::ZERO, DVec3::ONE));
+            }
+            let step = derivative.inverse() * off;
+            if !step.is_finite() {
+                return None;
+            }
+            // A place outside may be far outside: the iteration must not run away on the way to one inside.
+            t = (t + step).clamp(DVec3::splat(-1.0), DVec3::splat(2.0));
+        }
+        None
+    }
+
+    fn bounds(&self) -> (DVec3, DVec3) {
+        self.corners[1..].iter().fold((self.corners[0], self.corners[0]), |(lo, hi), &c| (lo.min(c), hi.max(c)))
+    }
+}
+
+/// The cells of a volume, to be found by place.
+pub(super) struct Cells {
+    cells: Vec<Cell>,
+    bin: f64,
+    bins: FxHashMap<IVec3, SmallVec<[u32; 4]>>,
+}
+
+impl Cells {
+    /// The cells between two layers are those of both nets laid over each other, so that the map is trilinear in each.
+    pub fn new(volume: &Volume) -> Self {
+        let mut cells = Vec::new();
+        let last = (volume.layers.len() - 1) as f64;
+        for (k, pair) in volume.layers.windows(2).enumerate() {
+            let (us, vs) = (merged(pair[0].counts[0], pair[1].counts[0]), merged(pair[0].counts[1], pair[1].counts[1]));
+            for u in us.windows(2) {
+                for v in vs.windows(2) {
+                    let corners = std::array::from_fn(|c| pair[c & 1].bilinear(u[c >> 2], v[c >> 1 & 1]));
+                    let low = DVec3::new(u[0], v[0], k as f64 / last);
+                    let high = DVec3::new(u[1], v[1], (k + 1) as f64 / last);
+                    cells.push(Cell { low, high, corners });
+                }
+            }
+        }
+        let size = |cell: &Cell| {
+            let (lo, hi) = cell.bounds();
+            (hi - lo).max_element()
+        };
+        let bin = (cells.iter().map(size).sum::<f64>() / cells.len().max(1) as f64).max(1e-3);
+        let mut bins = FxHashMap::<IVec3, SmallVec<[u32; 4]>>::default();
+        for (i, cell) in cells.iter().enumerate() {
+            let (lo, hi) = cell.bounds();
+            let (lo, hi) = ((lo / bin).floor().as_ivec3(), (hi / bin).floor().as_ivec3());
+            for x in lo.x..=hi.x {
+                for y in lo.y..=hi.y {
+                    for z in lo.z..=hi.z {
+                        bins.entry(IVec3::new(x, y, z)).or_default().push(i as u32);
+                    }
+                }
+            }
+        }
+        Self { cells, bin, bins }
+    }
+
+    /// (u, v, w) of a place; `None` outside the volume. Where cells overlap, the lowest one.
+    pub fn find(&self, x: DVec3) -> Option<DVec3> {
+        let candidates = self.bins.get(&(x / self.bin).floor().as_ivec3())?;
+        candidates.iter().find_map(|&i| {
+            let cell = &self.cells[i as usize];
+            let (lo, hi) = cell.bounds();
+            if x.cmplt(lo - NEAR_ENOUGH).any() || x.cmpgt(hi + NEAR_ENOUGH).any() {
+                return None;
+            }
+            cell.find(x).map(|t| cell.low + (cell.high - cell.low) * t)
+        })
+    }
+
+    /// Distortion of the map over target lengths of the whole edges u, v, w, in voxels.
+    pub fn distortion(&self, lengths: DVec3) -> Distortion {
+        let mut of_cells = Vec::with_capacity(self.cells.len());
+        for cell in &self.cells {
+            // Derivatives by lengths of the texture instead of by t.
+            let unit = (cell.high - cell.low) * lengths;
+            let (_, by_t) = cell.at(DVec3::splat(0.5));
+            let j = DMat3::from_cols(by_t.x_axis / unit.x, by_t.y_axis / unit.y, by_t.z_axis / unit.z);
+            // A fold shows at a corner first.
+            let least = (0..8)
+                .map(|c| {
+                    let t = DVec3::new((c >> 2) as f64, (c >> 1 & 1) as f64, (c & 1) as f64);
+                    let (_, by_t) = cell.at(t);
+                    by_t.determinant() / (unit.x * unit.y * unit.z)
+                })
+                .fold(f64::INFINITY, f64::min);
+            // Singular values of the base part, from the metric.
+            let (e, f, g) = (j.x_axis.length_squared(), j.x_axis.dot(j.y_axis), j.y_axis.length_squared());
+            let (mean, spread) = ((e + g) / 2.0, ((e - g) / 2.0).hypot(f));
+            let (s1, s2) = ((mean + spread).sqrt(), (mean - spread).max(0.0).sqrt());
+            of_cells.push(CellDistortion { angle: s1 / s2, area: s1 * s2, volume: j.determinant(), least });
+        }
+        Distortion::of(&of_cells)
+    }
+}
+
+/// Places in 0..1 at which one of two even divisions has a border.
+fn merged(a: usize, b: usize) -> Vec<f64> {
+    let mut all: Vec<f64> = (0..=a).map(|i| i as f64 / a as f64).chain((0..=b).map(|i| i as f64 / b as f64)).collect();
+    all.sort_by(f64::total_cmp);
+    all.dedup_by(|a, b| (*a - *b).abs() < 1e-12);
+    all
+}
+
+struct CellDistortion {
+    angle: f64,
+    area: f64,
+    volume: f64,
+    least: f64,
+}
+
+/// Mean, 95th percentile and largest value over cells.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Spread {
+    /// Mean.
+    pub mean: f64,
+    /// 95th percentile.
+    pub p95: f64,
+    /// Largest.
+    pub max: f64,
+}
+
+impl Spread {
+    fn of(values: impl Iterator<Item = f64>) -> Self {
+        let mut values: Vec<f64> = values.collect();
+        values.sort_by(f64::total_cmp);
+        let Some(&max) = values.last() else { return Self::default() };
+        let p95 = values[((values.len() - 1) as f64 * 0.95).round() as usize];
+        Self { mean: values.iter().sum::<f64>() / values.len() as f64, p95, max }
+    }
+}
+
+/// How the map of a patch distorts, over its cells (Brodersen et al. 2007). Singular values s1 ≥ s2 are those of the derivative by (u, v) in
+/// lengths of the texture.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Distortion {
+    /// s1/s2: 1 keeps angles.
+    pub angle: Spread,
+    /// Area s1·s2 over its mean, or the inverse where that is larger: 1 keeps ratios of areas.
+    pub area: Spread,
+    /// Volume over its mean, or the inverse where that is larger.
+    pub volume: Spread,
+    /// Smallest determinant over the mean one: not positive where the map folds.
+    pub least_determinant: f64,
+    /// Cells that fold over.
+    pub folded: usize,
+}
+
+impl Distortion {
+    fn of(cells: &[CellDistortion]) -> Self {
+        let n = cells.len().max(1) as f64;
+        let (area, volume) =
+            (cells.iter().map(|c| c.area).sum::<f64>() / n, cells.iter().map(|c| c.volume).sum::<f64>() / n);
+        let ratio = |value: f64, mean: f64| if value > mean { value / mean } else { mean / value };
+        Self {
+            angle: Spread::of(cells.iter().map(|c| c.angle)),
+            area: Spread::of(cells.iter().map(|c| ratio(c.area, area))),
+            volume: Spread::of(cells.iter().map(|c| ratio(c.volume, volume))),
+            least_determinant: cells.iter().map(|c| c.least / volume).fold(f64::INFINITY, f64::min),
+            folded: cells.iter().filter(|c| c.least <= 0.0).count(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::patch::Net;
+    use super::*;
+
+    /// A cylinder shell of 1 rad: radius 10 to 14, length 8 along x.
+    fn shell(layers: usize, cells: usize) -> Volume {
+        let net = |k: usize| {
+            let r = 10.0 + 4.0 * k as f64 / (layers - 1) as f64;
+            // More cells further out, as low distortion makes them.
+            let nu = cells + k;
+            let points = (0..=nu)
+                .flat_map(|i| {
+                    let a = i as f64 / nu as f64;
+                    (0..=4).map(move |j| DVec3::new(2.0 * j as f64, r * a.cos(), r * a.sin()))
+                })
+                .collect();
+            Net { counts: [nu, 4], points }
+        };
+        Volume { layers: (0..layers).map(net).collect() }
+    }
+
+    #[test]
+    fn the_inverse_is_exact() {
+        let volume = shell(3, 7);
+        let cells = Cells::new(&volume);
+        for i in 0..2000 {
+            let uvw = DVec3::new(
+                (f64::from(i) * 0.618_033_99).fract(),
+                (f64::from(i) * 0.754_877_67).fract(),
+                (f64::from(i) * 0.569_840_29).fract(),
+            );
+            let found = cells.find(volume.at(uvw)).unwrap();
+            assert!(volume.at(found).distance(volume.at(uvw)) < 1e-5 && found.distance(uvw) < 1e-5, "{uvw} {found}");
+        }
+        assert!(cells.find(DVec3::new(4.0, 9.0, 0.0)).is_none() && cells.find(DVec3::splat(1e9)).is_none());
+    }
+
+    #[test]
+    fn distortion_of_a_developable_base() {
+        // Lengths of the base: nothing is distorted there; at radius r the stretch along u is r/10.
+        let volume = shell(41, 40);
+        let distortion = Cells::new(&volume).distortion(DVec3::new(10.0, 8.0, 4.0));
+        // s1/s2 at the middle of the outermost cells, whose chords are inscribed.
+        assert!((distortion.angle.max - 13.95 / 10.0).abs() < 1e-3, "{distortion:?}");
+        // Outer layers have more cells.
+        assert!((1.2..1.22).contains(&distortion.angle.mean));
+        assert_eq!(distortion.folded, 0);
+        assert!((distortion.least_determinant - 10.0 / 12.0).abs() < 1e-2);
+    }
+
+    #[test]
+    fn folds_are_counted() {
+        let mut volume = shell(2, 4);
+        let n = volume.layers[1].points.len();
+        volume.layers[1].points[n / 2] = DVec3::new(4.0, 4.0, 3.0);
+        let distortion = Cells::new(&volume).distortion(DVec3::new(10.0, 8.0, 4.0));
+        assert!(distortion.folded > 0 && distortion.least_determinant < 0.0);
+    }
+}

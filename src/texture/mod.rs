@@ -1,0 +1,12 @@
+//! Geometric texturing: any solid wrapped onto any surface (Brodersen, Museth, Porumbescu & Budge 2007).
+//!
+//! A patch of the surface is spanned by geodesics between four points ([`patch`]), the space above it by layers of particles
+//! ([`volume`]), and the texture's bounding box is mapped into that space.
+
+mod cells;
+mod level;
+mod patch;
+mod path;
+mod volume;
+
+pub use cells::{Distortion, Spread};
