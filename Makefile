@@ -1,7 +1,7 @@
 # The two commands that do all the set-up on a fresh Debian or Ubuntu machine with cargo:
 #   make demo    build, then an editing session on the models in assets/; results in out/
 #   make test    the whole test suite
-.PHONY: help setup demo test bench nightly blender ci clean
+.PHONY: help setup demo gallery test bench nightly blender ci clean
 .DEFAULT_GOAL := help
 
 CARGO ?= cargo
@@ -10,6 +10,7 @@ export PATH := $(PATH):$(HOME)/.cargo/bin
 
 help:
 	@echo 'make demo     build in release mode, edit two models, leave .vdb, .obj and .png in out/'
+	@echo 'make gallery  run the recipes of examples/recipes, leave their pictures in docs/images/gallery'
 	@echo 'make test     the whole test suite'
 	@echo 'make bench    kernels, every operator beside OpenVDB, cost and memory by size'
 	@echo 'make nightly  the test suite in release mode with the slow tests, and without OpenVDB'
@@ -23,6 +24,9 @@ setup:
 
 demo: setup
 	@scripts/demo.sh
+
+gallery: setup
+	@scripts/gallery.sh
 
 test: setup
 	$(CARGO) test --locked --no-fail-fast

@@ -48,7 +48,12 @@ mod bridge {
                 });
                 (file, task)
             });
-            found.configure(&mut bridge).opt_level(3).files(["cpp/archive.cc", "cpp/grid.cc", "cpp/reference_io.cc"]);
+            found.configure(&mut bridge).opt_level(3).files([
+                "cpp/archive.cc",
+                "cpp/grid.cc",
+                "cpp/vector.cc",
+                "cpp/reference_io.cc",
+            ]);
             bridge.cargo_metadata(false).compile("vdb_edit_bridge");
             tools.into_iter().try_for_each(|(file, task)| {
                 task.join().map_err(|_| format!("the compiler failed on {file}, see above"))

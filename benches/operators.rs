@@ -1,7 +1,10 @@
 //! Every operator beside OpenVDB's own tool, as `crosscheck` does it, printed as the tables of docs/PERFORMANCE.md.
 //!
 //! `cargo bench --bench operators -- [MESH [RESOLUTION...]]`; without arguments a model of `assets/` at 256 voxels. One and
-//! two threads, each measured in a process of its own.
+//! two threads, each measured in a process of its own. `-- papers` prints the rows of the papers' tables instead.
+
+#[path = "papers/mod.rs"]
+mod papers;
 
 use std::process::Command;
 
@@ -17,6 +20,7 @@ fn main() -> Result<()> {
     let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
     match words.as_slice() {
         ["--threads", threads, file, resolution] => measure(file, resolution.parse()?, threads.parse()?),
+        ["papers"] => papers::measure(2),
         [] => compare("assets/nefertiti_70k.ply", &["256"]),
         [file] => compare(file, &["256"]),
         [file, resolutions @ ..] => compare(file, resolutions),

@@ -46,8 +46,8 @@ fn measure(across: u32) -> Result<()> {
     row("shape", &level_set, before, || sphere(across, &run))?;
     let one_step = |method, scheme| Smooth {
         method,
-        width: None,
         evolution: EvolutionOptions { iterations: Some(1), scheme: Some(scheme), ..EvolutionOptions::default() },
+        ..Smooth::default()
     };
     in_place("smooth, curvature, first order, one step", &level_set, |grid| {
         Ok(smooth(grid, &one_step(SmoothMethod::Curvature, Scheme::First), &run).map(drop)?)

@@ -34,6 +34,7 @@ namespace vdb_edit {
 namespace vio = openvdb::io;
 
 std::unique_ptr<Leaves> leaves_of(const openvdb::GridBase::ConstPtr& grid);
+std::unique_ptr<Leaves> component_of(const openvdb::GridBase::ConstPtr& grid, std::uint32_t component);
 
 // --- the library ---
 
@@ -613,6 +614,11 @@ GridHeader Archive::grid_header(std::size_t index) const
 std::unique_ptr<Leaves> archive_leaves(const Archive& archive, std::size_t index)
 {
     return leaves_of(archive.impl->entries.at(index).grid);
+}
+
+std::unique_ptr<Leaves> archive_component(const Archive& archive, std::size_t index, std::uint32_t component)
+{
+    return component_of(archive.impl->entries.at(index).grid, component);
 }
 
 // --- comparing ---

@@ -106,6 +106,9 @@ public:
 /// The leaves of grid `index`, which must be of type float or double.
 std::unique_ptr<Leaves> archive_leaves(const Archive& archive, std::size_t index);
 
+/// Component 0, 1 or 2 of grid `index`, which must be of type Vec3f or Vec3d: active tiles, no nodes.
+std::unique_ptr<Leaves> archive_component(const Archive& archive, std::size_t index, std::uint32_t component);
+
 /// A float grid held by OpenVDB: what is written, and what OpenVDB's own tools work on.
 class FloatGrid {
 public:

@@ -14,44 +14,13 @@ namespace vdb_edit {
 
 namespace {
 
-constexpr std::size_t kLeafVoxels = 512;
-constexpr std::size_t kMaskWords = 8;
 constexpr std::size_t kNodeWords = 64; // 16^3 slots
-
-void require(bool holds, const char* what)
-{
-    if (!holds) throw std::invalid_argument(what);
-}
 
 } // namespace
 
 // --- reading ---
 
-struct Leaves::Impl {
-    virtual ~Impl() = default;
-    virtual std::size_t count() const = 0;
-    virtual double background() const = 0;
-    virtual void origins(rust::Slice<std::int32_t>) const = 0;
-    virtual void copy(std::size_t, rust::Slice<float>, rust::Slice<std::uint64_t>) const = 0;
-    virtual std::size_t node_count() const = 0;
-    virtual void node_origins(rust::Slice<std::int32_t>) const = 0;
-    virtual void node_inside(rust::Slice<std::uint64_t>) const = 0;
-    virtual void tiles(rust::Vec<Tile>&) const = 0;
-    virtual void inactive_tile_range(double&, double&) const = 0;
-};
-
 namespace {
-
-template<typename NodeT>
-void write_origins(const std::vector<const NodeT*>& nodes, rust::Slice<std::int32_t> out)
-{
-    require(out.size() == nodes.size() * 3, "origins: wrong length");
-    auto* o = out.data();
-    for (const auto* node : nodes) {
-        const openvdb::Coord origin = node->origin();
-        for (int axis = 0; axis < 3; ++axis) *o++ = origin[axis];
-    }
-}
 
 /// The leaves of a tree of float or double.
 template<typename GridT>

@@ -8,11 +8,44 @@
 
 #include <iostream>
 #include <mutex>
+#include <stdexcept>
 #include <vector>
 
 namespace vdb_edit {
 
 using LeafNode = openvdb::FloatTree::LeafNodeType;
+
+constexpr std::size_t kLeafVoxels = 512;
+constexpr std::size_t kMaskWords = 8;
+
+inline void require(bool holds, const char* what)
+{
+    if (!holds) throw std::invalid_argument(what);
+}
+
+struct Leaves::Impl {
+    virtual ~Impl() = default;
+    virtual std::size_t count() const = 0;
+    virtual double background() const = 0;
+    virtual void origins(rust::Slice<std::int32_t>) const = 0;
+    virtual void copy(std::size_t, rust::Slice<float>, rust::Slice<std::uint64_t>) const = 0;
+    virtual std::size_t node_count() const = 0;
+    virtual void node_origins(rust::Slice<std::int32_t>) const = 0;
+    virtual void node_inside(rust::Slice<std::uint64_t>) const = 0;
+    virtual void tiles(rust::Vec<Tile>&) const = 0;
+    virtual void inactive_tile_range(double&, double&) const = 0;
+};
+
+template<typename NodeT>
+void write_origins(const std::vector<const NodeT*>& nodes, rust::Slice<std::int32_t> out)
+{
+    require(out.size() == nodes.size() * 3, "origins: wrong length");
+    auto* o = out.data();
+    for (const auto* node : nodes) {
+        const openvdb::Coord origin = node->origin();
+        for (int axis = 0; axis < 3; ++axis) *o++ = origin[axis];
+    }
+}
 
 struct FloatGrid::Impl {
     openvdb::FloatGrid::Ptr grid;

@@ -44,42 +44,88 @@ pub fn replace_atomically(path: &Path, produce: impl FnOnce(&Path) -> Result<()>
     replace(path, &target, |file| produce(file.path()))
 }
 
-/// The steps that both faces share: refuse early, create, fill, flush, rename.
+/// Files that appear together: each is written beside its place first, and [`commit`](Self::commit) renames them all. Without it
+/// nothing is left of them.
+#[derive(Default)]
+pub struct Staging(Vec<Pending>);
+
+impl Staging {
+    /// Where the file that is to be at `path` is written until then: in the same folder, with the same extension. Devices and
+    /// pipes are themselves.
+    pub fn place(&mut self, path: &Path) -> Result<PathBuf> {
+        if fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+            return Ok(path.into());
+        }
+        let pending = Pending::new(path, &final_target(path)?)?;
+        let place = pending.file.path().to_path_buf();
+        self.0.push(pending);
+        Ok(place)
+    }
+
+    /// Renames all of them, in the order in which they were asked for.
+    pub fn commit(self) -> Result<()> {
+        self.0.into_iter().try_for_each(Pending::finish)
+    }
+}
+
+/// The steps that the faces share: refuse early, create, fill, flush, rename.
 fn replace(path: &Path, target: &Path, fill: impl FnOnce(&mut NamedTempFile) -> Result<()>) -> Result<()> {
-    let existing = match fs::metadata(target) {
-        Ok(metadata) if metadata.is_dir() => return Err(EditError::output(path, "it is a folder, not a file")),
-        Ok(metadata) if !metadata.is_file() => {
-            return Err(EditError::output(path, "it is a device or a pipe; a regular file would work"));
-        }
-        Ok(metadata) if metadata.permissions().readonly() => {
-            return Err(EditError::output(path, "the existing file is read-only"));
-        }
-        Ok(metadata) => Some(metadata.permissions()),
-        Err(_) => None,
-    };
-    let folder = folder_of(target);
-    let suffix = target.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".vdb-edit-").suffix(&suffix);
-    // Temporary files are private (0600) by default; a result should be as readable as any file the user creates.
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let mut file = builder.tempfile_in(folder).map_err(|e| failed(path, e))?;
-    let _unfinished = Unfinished::new(file.path());
-    fill(&mut file)?;
-    // Reopened by name: `produce` may have replaced the file by another one.
-    let flushed = File::open(file.path()).and_then(|f| f.sync_all());
-    flushed.map_err(|e| failed(path, e))?;
-    if let Some(permissions) = existing {
-        fs::set_permissions(file.path(), permissions).map_err(|e| failed(path, e))?;
+    let mut pending = Pending::new(path, target)?;
+    fill(&mut pending.file)?;
+    pending.finish()
+}
+
+/// A file on its way to its place.
+struct Pending {
+    /// As it was asked for.
+    path: PathBuf,
+    target: PathBuf,
+    file: NamedTempFile,
+    /// Of the file that it replaces.
+    permissions: Option<fs::Permissions>,
+    _unfinished: Unfinished,
+}
+
+impl Pending {
+    fn new(path: &Path, target: &Path) -> Result<Self> {
+        let permissions = match fs::metadata(target) {
+            Ok(metadata) if metadata.is_dir() => return Err(EditError::output(path, "it is a folder, not a file")),
+            Ok(metadata) if !metadata.is_file() => {
+                return Err(EditError::output(path, "it is a device or a pipe; a regular file would work"));
+            }
+            Ok(metadata) if metadata.permissions().readonly() => {
+                return Err(EditError::output(path, "the existing file is read-only"));
+            }
+            Ok(metadata) => Some(metadata.permissions()),
+            Err(_) => None,
+        };
+        let suffix = target.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
+        let mut builder = tempfile::Builder::new();
+        builder.prefix(".vdb-edit-").suffix(&suffix);
+        // Temporary files are private (0600) by default; a result should be as readable as any file the user creates.
+        #[cfg(unix)]
+        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+        let file = builder.tempfile_in(folder_of(target)).map_err(|e| failed(path, e))?;
+        let unfinished = Unfinished::new(file.path());
+        Ok(Self { path: path.into(), target: target.into(), file, permissions, _unfinished: unfinished })
     }
-    file.into_temp_path().persist(target).map_err(|e| failed(path, e.error))?;
-    // The rename itself is durable once the folder is; not every file system lets a folder be synchronised.
-    #[cfg(unix)]
-    if let Ok(folder) = File::open(folder) {
-        let _ = folder.sync_all();
+
+    fn finish(self) -> Result<()> {
+        let Self { path, target, file, permissions, _unfinished } = self;
+        // Reopened by name: whoever filled it may have replaced the file by another one.
+        let flushed = File::open(file.path()).and_then(|f| f.sync_all());
+        flushed.map_err(|e| failed(&path, e))?;
+        if let Some(permissions) = permissions {
+            fs::set_permissions(file.path(), permissions).map_err(|e| failed(&path, e))?;
+        }
+        file.into_temp_path().persist(&target).map_err(|e| failed(&path, e.error))?;
+        // The rename itself is durable once the folder is; not every file system lets a folder be synchronised.
+        #[cfg(unix)]
+        if let Ok(folder) = File::open(folder_of(&target)) {
+            let _ = folder.sync_all();
+        }
+        Ok(())
     }
-    Ok(())
 }
 
 /// Temporary files that are being filled.
@@ -181,6 +227,29 @@ mod tests {
         assert!(matches!(error, EditError::Cancelled { .. }), "{error}");
         assert_eq!(fs::read(&path).unwrap(), b"old");
         assert_eq!(names(folder.path()), ["a.txt"]);
+    }
+
+    #[test]
+    fn staged_files_appear_together_or_not_at_all() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        fs::write(path("a.txt"), "old").unwrap();
+        let stage = |staging: &mut Staging| {
+            for name in ["a.txt", "b.txt"] {
+                let place = staging.place(&path(name)).unwrap();
+                write_atomically(&place, |w| w.write_all(b"new")).unwrap();
+            }
+        };
+        let mut staging = Staging::default();
+        stage(&mut staging);
+        drop(staging);
+        assert_eq!(fs::read(path("a.txt")).unwrap(), b"old");
+        assert_eq!(names(folder.path()), ["a.txt"]);
+        let mut staging = Staging::default();
+        stage(&mut staging);
+        staging.commit().unwrap();
+        assert_eq!(fs::read(path("a.txt")).unwrap(), b"new");
+        assert_eq!(names(folder.path()), ["a.txt", "b.txt"]);
     }
 
     #[test]

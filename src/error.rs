@@ -100,6 +100,23 @@ impl EditError {
         Self::Output { path: path.as_ref().into(), problem: problem.into() }
     }
 
+    /// The same, said of a place: the line of a recipe, say.
+    pub fn at(self, place: &str) -> Self {
+        match self {
+            Self::Parameter { field, value, accepted, .. } => {
+                Self::Parameter { operation: place.into(), field, value, accepted }
+            }
+            Self::Input { path, problem } => Self::Input { path, problem: format!("{problem} ({place})") },
+            Self::NotALevelSet { name, problem, .. } => Self::NotALevelSet { operation: place.into(), name, problem },
+            Self::Output { path, problem } => Self::Output { path, problem: format!("{problem} ({place})") },
+            Self::Memory { needed, limit, advice, .. } => {
+                Self::Memory { operation: place.into(), needed, limit, advice }
+            }
+            Self::Unmet { problem, .. } => Self::Unmet { operation: place.into(), problem },
+            Self::Cancelled { .. } => self,
+        }
+    }
+
     /// The exit status of the command for this error.
     pub fn exit_code(&self) -> u8 {
         match self {

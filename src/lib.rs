@@ -50,9 +50,11 @@
 //! | [`region`] | where an operator acts, and how strongly |
 //! | [`pde`] | time stepping: flows, renormalisation, tracking of the band |
 //! | [`mesh`] | triangle meshes: files, to a level set and back, exact rebuilding |
+//! | [`scan`] | scans (NRRD, NIfTI), the surfaces in them, segmentation |
 //! | `vdb` | OpenVDB files and OpenVDB's own tools as a reference (feature `openvdb`) |
 //! | [`render`] | pictures |
 //! | [`ops`] | the operators and their registry |
+//! | [`recipe`] | whole editing sessions from TOML files |
 //! | `crosscheck` | our operators beside OpenVDB's, timed and compared (feature `openvdb`) |
 //! | `cli` | the command (feature `cli`) |
 //!
@@ -72,14 +74,17 @@ pub mod cli;
 #[cfg(feature = "openvdb")]
 pub mod crosscheck;
 pub mod error;
+pub(crate) mod files;
 pub mod grid;
 pub mod levelset;
 pub mod mesh;
 pub mod ops;
 pub mod pde;
+pub mod recipe;
 pub mod region;
 pub mod render;
 pub mod run;
+pub mod scan;
 pub mod spec;
 pub mod stencil;
 pub mod texture;

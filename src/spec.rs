@@ -1,6 +1,7 @@
 //! The one-line grammar of shapes and regions: `sphere center=0,0,1 radius=2`.
 
 use std::cell::Cell;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use glam::{DMat3, DQuat, DVec3};
@@ -167,6 +168,45 @@ pub fn parse_rotation(text: &str) -> Result<DQuat, String> {
     }
 }
 
+/// A specification whose relative files begin in `folder`, and those files.
+///
+/// Files are the values of `file` and, for a `curve`, of `a` and `b`; all else stays as it is, wrong or not.
+pub fn rebased(text: &str, folder: &Path) -> (String, Vec<PathBuf>) {
+    let keys: &[&str] = match text.split_whitespace().any(|word| word == "curve") {
+        true => &["file=", "a=", "b="],
+        false => &["file="],
+    };
+    let (mut out, mut files) = (String::new(), Vec::new());
+    let mut rest = text;
+    while let Some(space) = rest.find(char::is_whitespace) {
+        let (before, after) = rest.split_at(space + rest[space..].chars().next().map_or(1, char::len_utf8));
+        out.push_str(before);
+        rest = after;
+        let Some(key) = keys.iter().find(|key| rest.starts_with(**key)) else { continue };
+        let value = &rest[key.len()..];
+        // A quoted value ends with its quote; another at a space, or where an expression goes on.
+        let (name, end) = match value.strip_prefix('"') {
+            Some(quoted) => match quoted.find('"') {
+                Some(end) => (&quoted[..end], end + 2),
+                None => continue,
+            },
+            None => {
+                let end = value.find(|c: char| c.is_whitespace() || matches!(c, ',' | ')' | '"'));
+                let end = end.unwrap_or(value.len());
+                (&value[..end], end)
+            }
+        };
+        if !name.is_empty() {
+            let path = folder.join(name);
+            out.push_str(&format!("{key}\"{}\"", path.display()));
+            files.push(path);
+            rest = &value[end..];
+        }
+    }
+    out.push_str(rest);
+    (out, files)
+}
+
 /// "did you mean", or the list of what there is.
 pub fn suggest<'a>(given: &str, known: impl Iterator<Item = &'a str>) -> String {
     let known: Vec<&str> = known.collect();
@@ -232,6 +272,20 @@ mod tests {
         assert!(error("sphere center=1,2", |s| s.center().map(drop)).contains("three finite numbers"));
         assert!(error("torus axis=0,0,0", |s| s.axes().map(drop)).contains("not zero"));
         assert!(error("spere", |s| Err(s.unknown_kind(&["sphere", "box"]))).contains("did you mean `sphere`"));
+    }
+
+    #[test]
+    fn files_of_specifications_begin_in_a_folder() {
+        let folder = Path::new("r");
+        let (text, files) = rebased("or curve a=x.vdb b=\"y z.vdb\" d=7,9", folder);
+        assert_eq!(text, "or curve a=\"r/x.vdb\" b=\"r/y z.vdb\" d=7,9");
+        assert_eq!(files, [PathBuf::from("r/x.vdb"), "r/y z.vdb".into()]);
+        assert_eq!(rebased("capsule a=0,0,0 b=1,0,0 radius=1", folder).0, "capsule a=0,0,0 b=1,0,0 radius=1");
+        assert_eq!(rebased("mask file=/m.vdb", folder).1, [PathBuf::from("/m.vdb")]);
+        assert_eq!(rebased("mask file=\"m", folder).0, "mask file=\"m");
+        let (text, files) = rebased("union(bezier file=p.bpt, sphere radius=1, bezier file=q.bpt)", folder);
+        assert_eq!(text, "union(bezier file=\"r/p.bpt\", sphere radius=1, bezier file=\"r/q.bpt\")");
+        assert_eq!(files.len(), 2);
     }
 
     #[test]

@@ -349,6 +349,58 @@ fn volumes_become_level_sets_at_a_value() {
 }
 
 #[test]
+fn scans_become_level_sets() {
+    let desk = Desk::new();
+    let mut text =
+        String::from("NRRD0004\ntype: float\ndimension: 3\nsizes: 32 32 17\nspacings: 0.5 0.5 1\nencoding: text\n\n");
+    for i in 0..32 * 32 * 17 {
+        let p =
+            DVec3::new(f64::from(i % 32) - 15.5, f64::from(i / 32 % 32) - 15.5, 2.0 * f64::from(i / 1024) - 16.0) * 0.5;
+        text += &format!("{:.4} ", 100.0 - 10.0 * p.length());
+    }
+    std::fs::write(desk.path("scan.nrrd"), &text).unwrap();
+    let volume = 4.0 / 3.0 * std::f64::consts::PI * 125.0;
+    let found = desk.done(&["convert", "scan.nrrd", "-o", "a.vdb", "--iso", "50", "--check", "--json"]).json();
+    assert!((found["volume_after"].as_f64().unwrap() / volume - 1.0).abs() < 0.03, "{found}");
+    assert!(found["warnings"][0].as_str().unwrap().contains("resampled"), "{found}");
+    assert_eq!(found["voxel_size"], 0.5);
+    let segmented =
+        desk.done(&["segment", "scan.nrrd", "-o", "b.ply", "--iso", "50", "--smoothness", "0.1", "--json"]).json();
+    assert!((segmented["volume_after"].as_f64().unwrap() / volume - 1.0).abs() < 0.03, "{segmented}");
+    let hollow = desk.done(&["convert", "scan.nrrd", "-o", "c.vdb", "--iso", "50", "--invert", "--json"]).json();
+    assert!(hollow["volume_after"].as_f64().unwrap() > 2.0 * volume);
+    let seeded = desk.done(&["segment", "a.vdb", "-o", "d.vdb", "--iso", "0", "--invert", "--json"]);
+    assert_eq!(seeded.code, 0);
+    desk.run(&["convert", "scan.nrrd", "-o", "e.vdb"]).fails(3, &["--iso", "segment"]);
+    desk.run(&["convert", "a.vdb", "-o", "e.vdb", "--iso", "0", "--invert"]).fails(2, &["invert"]);
+    desk.run(&["convert", "scan.nrrd", "-o", "e.vdb", "--iso", "500"]).fails(3, &["no voxel holds more"]);
+    std::fs::write(desk.path("short.nrrd"), &text[..text.len() / 2]).unwrap();
+    desk.run(&["convert", "short.nrrd", "-o", "e.vdb", "--iso", "50"]).fails(3, &["truncated"]);
+    desk.run(&["segment", "short.nrrd", "-o", "e.vdb", "--iso", "50"]).fails(3, &["truncated"]);
+    desk.run(&["segment", "scan.nrrd", "-o", "e.vdb"]).fails(2, &["iso"]);
+}
+
+#[test]
+fn solids_combine() {
+    let desk = Desk::new();
+    let made = |spec: &str| {
+        let made = desk.done(&["shape", spec, "-o", "a.vdb", "--voxel-size", "0.02", "--check", "--json"]).json();
+        made["volume_after"].as_f64().unwrap()
+    };
+    let drilled = made("difference(box size=1,1,1, cylinder radius=0.2 height=2)");
+    assert!((drilled - (1.0 - std::f64::consts::PI * 0.04)).abs() < 0.01, "{drilled}");
+    let (sharp, smooth) = (
+        made("union(sphere radius=0.5, sphere center=0.6,0,0 radius=0.4)"),
+        made("smooth-union(radius=0.2, sphere radius=0.5, sphere center=0.6,0,0 radius=0.4)"),
+    );
+    assert!(smooth > 1.01 * sharp, "{smooth} {sharp}");
+    desk.run(&["shape", "union(sphere radius=1)", "-o", "b.vdb"]).fails(2, &["two or more"]);
+    desk.run(&["shape", "intersection(sphere radius=1, sphere radius=1 center=5,0,0)", "-o", "b.vdb"])
+        .fails(2, &["overlap"]);
+    assert_eq!(desk.names(), ["a.vdb"]);
+}
+
+#[test]
 fn impossible_sizes() {
     let desk = Desk::new();
     desk.cube("cube.obj", "1");
@@ -610,7 +662,12 @@ fn info_writes_curvatures_beside_the_level_set() {
         assert!(desk.done(&["compare", "s.vdb", &out, "--json"]).json()["identical"].as_bool().unwrap());
     }
     desk.run(&["info", "s.vdb", "--write-curvature", "men", "o.vdb"]).fails(2, &["`mean`"]);
-    desk.run(&["info", "s.vdb", "--write-curvature", "mean", "o.obj"]).fails(2, &[".vdb"]);
+    desk.run(&["info", "s.vdb", "--write-curvature", "mean", "o.stl"]).fails(2, &[".vdb", ".ply"]);
+    let colored = desk.done(&["info", "s.vdb", "--write-curvature", "gaussian", "o.ply", "--json"]).json();
+    // Red and blue are full at balls of 8 voxels, 0.8 world units.
+    let full = colored["curvature"]["color_range"][1].as_f64().unwrap();
+    assert!((full - 1.0 / 0.64).abs() < 1e-6, "{full}");
+    assert!(std::fs::read(desk.path("o.ply")).unwrap().windows(3).any(|w| w == b"red"));
     desk.run(&["info", "s.vdb", "mean.vdb", "--write-curvature", "mean", "o.vdb"]).fails(2, &["one input"]);
     assert!(!desk.path("o.vdb").exists());
 }

@@ -119,7 +119,7 @@ fn filters_with_track() {
             (SmoothMethod::Median, 2, Filter::Median(2)),
         ] {
             for (evolution, tracker) in [(&first, FIRST), (&like, Tracker::default())] {
-                let params = Smooth { method, width: Some(width), evolution: evolution.clone() };
+                let params = Smooth { method, width: Some(width), evolution: evolution.clone(), ..Smooth::default() };
                 let mut ours = level_set.clone();
                 smooth(&mut ours, &params, &RunOptions::default()).unwrap();
                 let name = format!("{name} {filter:?}");

@@ -19,9 +19,26 @@ fn needed(entry: &Entry) -> Map<String, Value> {
         "shape" => json!({ "spec": "torus major=1 minor=0.4 axis=x", "voxel_size": DX }),
         // Off the lattice, so that voxels are computed.
         "transform" => json!({ "steps": ["rotate z,30", "translate 0.123,0,0"] }),
+        "segment" => json!({ "volume": scan(), "iso": 0.0 }),
         _ => json!({}),
     };
     values.as_object().unwrap().clone()
+}
+
+/// A scan of a ball of 8 voxels, in a file that stays for the whole run.
+fn scan() -> String {
+    static FILE: std::sync::OnceLock<tempfile::TempPath> = std::sync::OnceLock::new();
+    let path = FILE.get_or_init(|| {
+        let mut file = tempfile::Builder::new().suffix(".nrrd").tempfile().unwrap();
+        let mut text = String::from("NRRD0004\ntype: float\ndimension: 3\nsizes: 24 24 24\nencoding: text\n\n");
+        for i in 0..24 * 24 * 24 {
+            let p = IVec3::new(i % 24, i / 24 % 24, i / 576).as_dvec3() - 11.5;
+            text += &format!("{:.3}\n", 8.0 - p.length());
+        }
+        std::io::Write::write_all(&mut file, text.as_bytes()).unwrap();
+        file.into_temp_path()
+    });
+    path.display().to_string()
 }
 
 fn made(distance: impl Fn(DVec3) -> f64 + Sync) -> LevelSet {

@@ -7,9 +7,9 @@ use clap::{Arg, ArgMatches, Command};
 use serde_json::{Value, json};
 
 use super::context::Context;
-use super::input::{self, InputOptions};
-use super::{Verb, args, table};
+use super::{Verb, args, files, table};
 use crate::error::{EditError, Result};
+use crate::files::input;
 use crate::ops::compare::{Comparison, compare};
 
 /// The command.
@@ -37,7 +37,7 @@ fn build(command: Command) -> Command {
 fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let paths: Vec<PathBuf> = args::paths(matches, "input");
     let mut warnings = Vec::new();
-    let inputs = input::load(&paths, &InputOptions::new(matches)?, &mut warnings, context)?;
+    let inputs = input::load(&paths, &files::input_options(matches)?, &mut warnings, &context.run)?;
     let [a, b] = &inputs[..] else { return Ok(()) };
     let comparison = compare(&a.level_set, &b.level_set, &context.run)?;
     if comparison.resampled {

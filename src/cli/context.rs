@@ -4,8 +4,9 @@ use clap::ArgMatches;
 
 use super::args::{IsaChoice, MemoryLimit};
 use super::report::{Format, Reporter};
-use super::{size, volume};
+use super::size;
 use crate::error::{EditError, Result};
+use crate::files::volume;
 use crate::run::RunOptions;
 use crate::stencil::simd;
 

@@ -9,14 +9,15 @@ use serde_json::{Map, Value, json};
 
 use super::context::Context;
 use super::edit::{self, Edit};
-use super::input::{self, InputOptions};
-use super::mesh_output::attributes_of;
-use super::output::{Output, Written};
 use super::preview::Preview;
-use super::{Verb, args, options};
-use crate::error::Result;
+use super::{Verb, args, files, options};
+use crate::error::{EditError, Result};
+use crate::files::input;
+use crate::files::mesh_output::attributes_of;
+use crate::files::output::{Output, Written};
 use crate::mesh::{MeshFormat, Rebuild, rebuild};
 use crate::ops::{Summary, WorldLength};
+use crate::scan::Inside;
 
 /// The command.
 pub const VERB: Verb = Verb { name: "convert", build, run };
@@ -29,7 +30,7 @@ fn build(command: Command) -> Command {
              A mesh becomes a mesh directly, unless a voxel size or resolution is given or an option needs a level set \
              (--iso, --adaptivity, --quads): then by way of one.",
         )
-        .arg(args::path("input").value_name("IN").required(true).help("A .vdb, a mesh, or `-`"))
+        .arg(args::path("input").value_name("IN").required(true).help("A .vdb, a mesh, a scan (.nrrd, .nhdr, .nii, .nii.gz; with --iso), or `-`"))
         .arg(
             Arg::new("iso")
                 .long("iso")
@@ -37,8 +38,15 @@ fn build(command: Command) -> Command {
                 .allow_hyphen_values(true)
                 .value_parser(ValueParser::new(options::length))
                 .help(
-                    "The surface at this distance, positive outside, in world units (or `1vx`) [default: 0]; of a volume that is no level set: at this value",
+                    "The surface at this distance, positive outside, in world units (or `1vx`) [default: 0]; of a volume or scan that is no level set: at this value, inside is above (densities)",
                 ),
+        )
+        .arg(
+            Arg::new("invert")
+                .long("invert")
+                .action(ArgAction::SetTrue)
+                .requires("iso")
+                .help("Of a volume that is no level set: inside is where its values are below --iso, not above"),
         )
         .arg(
             Arg::new("simplify")
@@ -79,8 +87,8 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let began = Instant::now();
     let paths: Vec<PathBuf> = args::paths(matches, "input");
     let Some(path) = paths.first() else { return Ok(()) };
-    let input_options = InputOptions::new(matches)?;
-    let output = Output::plan(matches, context)?;
+    let input_options = files::input_options(matches)?;
+    let output = files::output(matches, context)?;
     let preview = Preview::plan(matches)?;
     let iso = matches.get_one::<Value>("iso").cloned();
     if args::flag(matches, "dry-run") {
@@ -97,13 +105,20 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     }
     let mut warnings = Vec::new();
     let of_volume = match iso.as_ref().and_then(Value::as_f64) {
-        Some(iso) => input::load_iso(path, &input_options, iso as f32, &mut warnings, context)?,
+        Some(iso) => {
+            let inside = if args::flag(matches, "invert") { Inside::Below } else { Inside::Above };
+            input::load_iso(path, &input_options, iso as f32, inside, &mut warnings, &context.run)?
+        }
         None => None,
     };
     let is_volume = of_volume.is_some();
+    if args::flag(matches, "invert") && !is_volume {
+        let accepted = "a volume that is no level set; `--iso` of a level set is a distance, which has one inside";
+        return Err(EditError::parameter("convert", "invert", "true", accepted));
+    }
     let inputs = match of_volume {
         Some(input) => vec![input],
-        None => input::load(&paths, &input_options, &mut warnings, context)?,
+        None => input::load(&paths, &input_options, &mut warnings, &context.run)?,
     };
     let Some(mut level_set) = inputs.first().map(|input| input.level_set.clone()) else { return Ok(()) };
     let mut at = match iso.map(serde_json::from_value::<WorldLength>) {
@@ -128,7 +143,7 @@ fn mesh_to_mesh(path: &std::path::Path, output: &Output, began: Instant, context
     let is_kept = MeshFormat::of(&output.path).is_some_and(MeshFormat::has_attributes);
     let lost = attributes_of(&mesh).filter(|_| !is_kept);
     warnings.extend(lost.and_then(|attributes| output.mesh().loss(path, attributes, &output.path)));
-    let written = output.write_mesh(mesh, context).map_err(|error| input::naming(path, error))?;
+    let written = output.write_mesh(mesh, &context.run).map_err(|error| input::naming(path, error))?;
     let Written { bytes, details, warnings: more } = written;
     warnings.extend(more);
     for warning in &warnings {

@@ -4,10 +4,10 @@ use clap::{Arg, ArgAction, ArgMatches, Command};
 use serde_json::json;
 
 use super::context::Context;
-use super::input::{self, InputOptions};
-use super::{Verb, args, table};
+use super::{Verb, args, files, table};
 use crate::crosscheck::{Row, crosscheck, operators};
 use crate::error::{EditError, Result};
+use crate::files::input;
 use crate::mesh::MeshFormat;
 
 /// The command.
@@ -36,7 +36,7 @@ fn build(command: Command) -> Command {
 fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let paths = args::paths(matches, "input");
     let mut warnings = Vec::new();
-    let inputs = input::load(&paths, &InputOptions::new(matches)?, &mut warnings, context)?;
+    let inputs = input::load(&paths, &files::input_options(matches)?, &mut warnings, &context.run)?;
     warnings.iter().for_each(|warning| context.reporter.warn(warning));
     let Some(input) = inputs.first() else { return Ok(()) };
     let only: Vec<String> = matches.get_many::<String>("only").into_iter().flatten().cloned().collect();

@@ -6,11 +6,11 @@ use clap::ArgMatches;
 use serde_json::{Map, Value, json};
 
 use super::context::Context;
-use super::input::{self, Input, InputOptions};
-use super::output::{Output, Written};
 use super::preview::Preview;
-use super::{args, options, table};
-use crate::error::{EditError, Result};
+use super::{args, files, options, table};
+use crate::error::Result;
+use crate::files::input::{self, Input};
+use crate::files::output::{self, Output, Written};
 use crate::levelset::{LevelSet, Measures};
 use crate::ops::compare::changed_voxels;
 use crate::ops::{Arity, Entry, Outcome, Summary};
@@ -21,8 +21,8 @@ pub fn run(entry: &Entry, matches: &ArgMatches, context: &Context) -> Result<()>
     let values = options::collect(entry, matches);
     entry.check(values.clone())?;
     let paths = args::paths(matches, "input");
-    let input_options = InputOptions::new(matches)?;
-    let output = Output::plan(matches, context)?;
+    let input_options = files::input_options(matches)?;
+    let output = files::output(matches, context)?;
     let preview = Preview::plan(matches)?;
     if args::flag(matches, "dry-run") {
         return dry_run(entry.name, values, &input::probe(&paths, &input_options)?, &output, context);
@@ -30,7 +30,7 @@ pub fn run(entry: &Entry, matches: &ArgMatches, context: &Context) -> Result<()>
     let mut warnings = Vec::new();
     let inputs = match entry.arity {
         Arity::Source => Vec::new(),
-        Arity::One | Arity::Many => input::load(&paths, &input_options, &mut warnings, context)?,
+        Arity::One | Arity::Many => input::load(&paths, &input_options, &mut warnings, &context.run)?,
     };
     let level_sets = inputs.iter().map(|input| input.level_set.clone()).collect();
     let Outcome { level_set, mut summary } = entry.run(values, level_sets, &context.run)?;
@@ -96,11 +96,11 @@ impl Edit {
             voxels_changed: changed_voxels(before, &self.level_set),
         };
         if check {
-            verify(self.operation, &self.level_set)?;
+            output::verify(self.operation, &self.level_set)?;
         }
         preview.write(before, &self.level_set, context)?;
         let from = self.inputs.iter().find_map(Input::from);
-        let Written { bytes, warnings, details } = output.write(&self.level_set, self.iso, from, context)?;
+        let Written { bytes, warnings, details } = output.write(&self.level_set, self.iso, from, &context.run)?;
         let mut summary = self.summary.clone();
         let lost = |input: &Input| output.mesh().loss(&input.path, input.attributes?, &output.path);
         summary.warnings.extend(self.inputs.iter().filter_map(lost));
@@ -116,17 +116,6 @@ impl Edit {
         }
         context.reporter.result(&report.json(), || report.text())
     }
-}
-
-/// Refuses a result that is no valid level set.
-fn verify(operation: &str, level_set: &LevelSet) -> Result<()> {
-    let violations = level_set.check();
-    if violations.is_empty() {
-        return Ok(());
-    }
-    let said: Vec<String> = violations.iter().map(ToString::to_string).collect();
-    let problem = format!("--check: the result is not written: {}", said.join("; "));
-    Err(EditError::Unmet { operation: operation.into(), problem })
 }
 
 struct Facts {

@@ -7,12 +7,15 @@ use glam::DVec3;
 use serde_json::{Map, Value, json};
 
 use super::context::Context;
-use super::input::{self, InputOptions};
-use super::volume::{self, BandState, Description, GridDescription, VolumeGrid};
-use super::{Verb, args, output, size, table};
+use super::{Verb, args, files, size, table};
 use crate::error::{EditError, Result};
+use crate::files::input::{self, InputOptions};
+use crate::files::output;
+use crate::files::volume::{self, BandState, Description, GridDescription, VolumeGrid};
 use crate::levelset::{CurvatureKind, LevelSet, Measures, Violation, curvature};
-use crate::{mesh, spec};
+use crate::mesh::{self, MeshFormat};
+use crate::render::{CURVATURE_RANGE, vertex_colors};
+use crate::spec;
 
 /// The command.
 pub const VERB: Verb = Verb { name: "info", build, run };
@@ -26,15 +29,15 @@ fn build(command: Command) -> Command {
     let curvature = Arg::new("write-curvature")
         .long("write-curvature")
         .num_args(2)
-        .value_names(["mean|gaussian|min|max", "FILE.vdb"])
-        .help("Write a curvature of the level set as a float grid, after all that the file holds");
+        .value_names(["mean|gaussian|min|max", "FILE"])
+        .help("Write a curvature of the level set: to a .vdb as a float grid, after all that the file holds; to a mesh (.ply, .obj, .glb, .gltf, .off) as vertex colours");
     let command = command.about("Say what files hold, measure level sets and verify their invariants");
     args::grids(command.arg(files).arg(check).arg(curvature)).mut_arg("repair", |arg| arg.hide(true))
 }
 
 fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let paths: Vec<PathBuf> = args::paths(matches, "input");
-    let options = InputOptions::new(matches)?;
+    let options = files::input_options(matches)?;
     let curvature = CurvatureFile::plan(matches, &paths)?;
     let mut found = Vec::new();
     for path in &paths {
@@ -83,8 +86,11 @@ impl CurvatureFile {
             return refuse(word, spec::suggest(word, Self::KINDS.into_iter().map(|(name, _)| name)));
         };
         let path = PathBuf::from(path);
-        if input::is_pipe(&path) || !input::is_volume(&path) {
-            return refuse(&path.display().to_string(), "a file name that ends in .vdb".into());
+        let is_mesh = MeshFormat::of(&path).is_some_and(MeshFormat::has_attributes);
+        if input::is_pipe(&path) || !(is_mesh || input::is_volume(&path)) {
+            let accepted =
+                "a file name that ends in .vdb, or one of a mesh with colours: .ply, .obj, .glb, .gltf, .off";
+            return refuse(&path.display().to_string(), accepted.into());
         }
         if inputs.len() != 1 || inputs.iter().any(|input| input::is_pipe(input)) {
             return refuse(word, "one input that is a file".into());
@@ -96,26 +102,56 @@ impl CurvatureFile {
     /// Computes and writes it, and adds it to what is said of the file.
     fn write(self, inputs: &[PathBuf], options: &InputOptions, found: &mut Found, context: &Context) -> Result<()> {
         // The grid that the level set was read from is written as well.
-        let loaded = input::load_whole(inputs, options, &mut found.warnings, context)?;
+        let loaded = input::load_whole(inputs, options, &mut found.warnings, &context.run)?;
         let Some(input) = loaded.first() else { return Ok(()) };
         let field = curvature(&input.level_set, self.kind, &context.run)?;
+        let (least, most) = field.range().unwrap_or_default();
+        let unit = if self.kind == CurvatureKind::Gaussian { "world unit²" } else { "world unit" };
+        let shown = |v: f64| table::number(v);
+        let mut written = json!({
+            "kind": self.word, "output": self.path.display().to_string(),
+            "voxels": field.grid().active_voxels(), "min": least, "max": most,
+        });
+        let mut note = |key: &str, value: Value| {
+            if let Some(object) = written.as_object_mut() {
+                object.insert(key.to_owned(), value);
+            }
+        };
+        if !input::is_volume(&self.path) {
+            // Red and blue are full at a ball of as many voxels in every kind of curvature.
+            let full = CURVATURE_RANGE / input.level_set.voxel_size();
+            let full = if self.kind == CurvatureKind::Gaussian { full * full } else { full };
+            let mut mesh = mesh::level_set_to_mesh(&input.level_set, 0.0, &context.run)?;
+            mesh.colors = Some(vertex_colors(&mesh.positions, &field, full));
+            mesh::write(&self.path, &mesh)?;
+            note("color_range", json!([-full, full]));
+            note("vertices", mesh.positions.len().into());
+            found.text += &format!(
+                "{}: vertex colours by {} curvature, {} .. {} per {unit}; blue at -{}, red at {}\n",
+                self.path.display(),
+                self.word,
+                shown(least.into()),
+                shown(most.into()),
+                shown(full),
+                shown(full)
+            );
+            found.insert("curvature", written);
+            return Ok(());
+        }
         let name = format!("{}_curvature", self.word);
         let to_write = volume::FieldToWrite { field: &field, name: &name };
         let (bytes, warnings) =
             volume::write_field(&self.path, &input.level_set, to_write, input.from().map(|(volume, _)| volume))?;
         found.warnings.extend(warnings);
-        let (least, most) = field.range().unwrap_or_default();
-        let unit = if self.kind == CurvatureKind::Gaussian { "world unit²" } else { "world unit" };
-        let shown = |v: f32| table::number(v.into());
-        found.text +=
-            &format!("{}: grid {name}, {} .. {} per {unit}\n", self.path.display(), shown(least), shown(most));
-        if let Some(object) = found.json.as_object_mut() {
-            let written = json!({
-                "kind": self.word, "output": self.path.display().to_string(), "grid": name, "bytes": bytes,
-                "voxels": field.grid().active_voxels(), "min": least, "max": most,
-            });
-            object.insert("curvature".into(), written);
-        }
+        note("grid", name.as_str().into());
+        note("bytes", bytes.into());
+        found.text += &format!(
+            "{}: grid {name}, {} .. {} per {unit}\n",
+            self.path.display(),
+            shown(least.into()),
+            shown(most.into())
+        );
+        found.insert("curvature", written);
         Ok(())
     }
 }
@@ -128,6 +164,14 @@ struct Found {
     warnings: Vec<String>,
     /// Broken invariants, each with file and grid.
     violations: Vec<String>,
+}
+
+impl Found {
+    fn insert(&mut self, key: &str, value: Value) {
+        if let Some(object) = self.json.as_object_mut() {
+            object.insert(key.to_owned(), value);
+        }
+    }
 }
 
 fn examine(path: &Path, options: &InputOptions, context: &Context) -> Result<Found> {

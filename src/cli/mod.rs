@@ -13,23 +13,18 @@ mod convert;
 #[cfg(feature = "openvdb")]
 mod crosscheck;
 mod edit;
+mod files;
+mod geodesic;
 mod info;
-mod input;
-mod mesh_output;
 mod options;
-mod output;
 mod preview;
 mod progress;
 mod render;
 mod report;
+mod run;
 mod signal;
 mod size;
 mod table;
-#[cfg(feature = "openvdb")]
-mod volume;
-#[cfg(not(feature = "openvdb"))]
-#[path = "volume_absent.rs"]
-mod volume;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -54,9 +49,12 @@ const VERBS: &[Verb] = &[
     info::VERB,
     convert::VERB,
     compare::VERB,
+    geodesic::VERB,
     render::VERB,
     #[cfg(feature = "openvdb")]
     crosscheck::VERB,
+    run::VERB,
+    run::SCHEMA,
     completions::COMPLETIONS,
     completions::MAN,
 ];

@@ -2,14 +2,14 @@
 //!
 //! A parameter `d_min` becomes `--d-min`; what is typed becomes JSON by the parameter's kind, and what is not typed is not
 //! passed on, so that defaults live in the operator alone. Two declared exceptions: [`POSITIONALS`] are written without an
-//! option's name, and [`SEQUENCES`] are lists whose entries have options of their own and keep the order in which they were
+//! option's name, and a [`Sequence`] is a list whose entries have options of their own and keep the order in which they were
 //! typed.
 
 use clap::builder::{BoolValueParser, PossibleValuesParser, TypedValueParser, ValueParser};
 use clap::{Arg, ArgAction, ArgMatches, Command};
 use serde_json::{Map, Number, Value};
 
-use crate::ops::{Entry, Parameter};
+use crate::ops::{Entry, Parameter, Sequence};
 
 /// A parameter that is written without its name, before the inputs.
 struct Positional {
@@ -21,49 +21,7 @@ struct Positional {
 const POSITIONALS: &[Positional] = &[
     Positional { operator: "csg", parameter: "operation", value_name: "OP" },
     Positional { operator: "shape", parameter: "spec", value_name: "SPEC" },
-];
-
-/// A list parameter with several options: each value becomes an entry of the list, after the option's prefix.
-struct Sequence {
-    parameter: &'static str,
-    options: &'static [SequenceOption],
-}
-
-struct SequenceOption {
-    name: &'static str,
-    prefix: &'static str,
-    value_name: &'static str,
-    /// Instead of the parameter's own.
-    help: Option<&'static str>,
-}
-
-const fn option(
-    name: &'static str,
-    prefix: &'static str,
-    value_name: &'static str,
-    help: Option<&'static str>,
-) -> SequenceOption {
-    SequenceOption { name, prefix, value_name, help }
-}
-
-const SEQUENCES: &[Sequence] = &[
-    Sequence {
-        parameter: "region",
-        options: &[
-            option("region", "", "SPEC", None),
-            option("region-or", "or ", "SPEC", Some("Unite with the regions before")),
-            option("region-not", "not ", "SPEC", Some("Leave out the inside of this region")),
-        ],
-    },
-    Sequence {
-        parameter: "steps",
-        options: &[
-            option("scale", "scale ", "FACTOR", Some("Scale by this factor")),
-            option("rotate", "rotate ", "AXIS,DEGREES", Some("Rotate: `y,90`, or a quaternion `x,y,z,w`")),
-            option("translate", "translate ", "X,Y,Z", Some("Move, in world units")),
-            option("mirror", "mirror ", "AXIS", Some("Mirror along x, y or z")),
-        ],
-    },
+    Positional { operator: "segment", parameter: "volume", value_name: "IN" },
 ];
 
 /// `d_min` as `d-min`.
@@ -75,21 +33,17 @@ fn positional(entry: &Entry, parameter: &Parameter) -> Option<&'static Positiona
     POSITIONALS.iter().find(|p| p.operator == entry.name && p.parameter == parameter.name)
 }
 
-fn sequence(parameter: &Parameter) -> Option<&'static Sequence> {
-    SEQUENCES.iter().find(|s| s.parameter == parameter.name && parameter.is_list)
-}
-
 /// Adds the parameters of an operator to its command: positional ones, then options.
 pub fn add(mut command: Command, entry: &Entry) -> Command {
     for parameter in entry.parameters() {
-        command = match (positional(entry, &parameter), sequence(&parameter)) {
+        command = match (positional(entry, &parameter), parameter.sequence()) {
             (Some(place), _) => {
                 let arg = Arg::new(parameter.name.clone()).required(true).value_name(place.value_name);
                 command.arg(described(arg, &parameter).value_parser(Kind::of(&parameter).parser()))
             }
             (None, Some(sequence)) => sequence.options.iter().fold(command, |command, option| {
                 let arg = Arg::new(option.name)
-                    .long(option.name)
+                    .long(kebab(option.name))
                     .value_name(option.value_name)
                     .action(ArgAction::Append)
                     .allow_hyphen_values(true)
@@ -154,7 +108,7 @@ fn plain(value: &Value) -> String {
 pub fn collect(entry: &Entry, matches: &ArgMatches) -> Map<String, Value> {
     let mut values = Map::new();
     for parameter in entry.parameters() {
-        let value = match sequence(&parameter) {
+        let value = match parameter.sequence() {
             Some(sequence) => in_order(sequence, matches),
             None => typed(&parameter, matches),
         };
@@ -237,6 +191,7 @@ impl Kind {
             Self::Length => "LENGTH".into(),
             Self::Numbers if parameter.kind == "array" => "A,B".into(),
             Self::Numbers => "X,Y,Z".into(),
+            Self::Text if parameter.kind == "FILE" => "FILE".into(),
             Self::Flag | Self::Words(_) | Self::Text => "TEXT".into(),
         }
     }
@@ -363,7 +318,7 @@ mod tests {
     fn every_default_of_every_operator_can_be_typed() {
         for entry in REGISTRY {
             for parameter in entry.parameters() {
-                if sequence(&parameter).is_some() || parameter.is_list {
+                if parameter.sequence().is_some() || parameter.is_list {
                     continue;
                 }
                 let text = match &parameter.default {

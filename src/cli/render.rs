@@ -9,10 +9,10 @@ use glam::DVec3;
 use serde_json::{Map, json};
 
 use super::context::Context;
-use super::input::{self, InputOptions};
-use super::{Verb, args, output};
+use super::{Verb, args, files};
 use crate::atomic::write_atomically;
 use crate::error::{EditError, Result};
+use crate::files::{frames, input, output};
 use crate::levelset::LevelSet;
 use crate::region::{Region, RegionPlan};
 use crate::render::{CameraSpec, ColorBy, Frame, Image, RenderOptions, UpAxis, render};
@@ -118,7 +118,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let path = matches.get_one::<PathBuf>("output").cloned().unwrap_or_default();
     is_png(&path, "output")?;
     output::writable(&path)?;
-    let input_options = InputOptions::new(matches)?;
+    let input_options = files::input_options(matches)?;
     let options = options(matches);
     options.validate()?;
     let color = matches.get_one::<Color>("color-by").cloned().unwrap_or(Color::Clay);
@@ -140,7 +140,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let mut all = paths;
     all.extend(color.other());
     let mut warnings = Vec::new();
-    let inputs = input::load(&all, &input_options, &mut warnings, context)?;
+    let inputs = input::load(&all, &input_options, &mut warnings, &context.run)?;
     warnings.iter().for_each(|warning| context.reporter.warn(warning));
     let Some(input) = inputs.first() else { return Ok(()) };
     let region = plan.map(|plan| plan.on(&input.level_set, &context.run)).transpose()?;
@@ -224,18 +224,10 @@ fn frames(path: &Path, turntable: Option<u32>) -> Vec<(PathBuf, f64)> {
 
 /// The path of a frame: its number in the place of `####`, or before the ending.
 fn numbered(path: &Path, frame: u32) -> PathBuf {
-    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    let name = match name.find('#') {
-        Some(start) => {
-            let width = name[start..].chars().take_while(|c| *c == '#').count();
-            format!("{}{frame:0width$}{}", &name[..start], &name[start + width..])
-        }
-        None => match name.rsplit_once('.') {
-            Some((stem, ending)) => format!("{stem}.{frame:04}.{ending}"),
-            None => format!("{name}.{frame:04}"),
-        },
-    };
-    path.with_file_name(name)
+    frames::numbered(path, i64::from(frame)).unwrap_or_else(|| {
+        let ending = path.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
+        path.with_extension(format!("{frame:04}{ending}"))
+    })
 }
 
 /// Refuses what is no `.png`.

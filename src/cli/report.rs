@@ -93,6 +93,18 @@ impl Reporter {
         }
     }
 
+    /// A part of the result that is known before the rest, for people.
+    pub fn text(&self, text: impl FnOnce() -> String) {
+        if !self.json && !self.quiet {
+            // A reader that has gone away is told by the result.
+            let write = || drop(print(&text()));
+            match &self.display {
+                Some(display) => display.suspended(write),
+                None => write(),
+            }
+        }
+    }
+
     /// As [`result`](Self::result), where standard output carries a file.
     pub fn result_beside_output(&self, text: impl FnOnce() -> String) {
         if !self.quiet && self.format == Format::Text {

@@ -32,7 +32,7 @@ pub(crate) use prefetch::prefetch_faces;
 use topology::Topology;
 pub use topology::{Neighbours, neighbour_index};
 pub use transform::{Transform, VOXEL_SIZES};
-pub use volume::Volume;
+pub use volume::{VectorVolume, Volume};
 
 /// Largest index coordinate of a voxel, either sign: beyond it the arithmetic of neighbours could overflow.
 pub const MAX_COORD: i32 = 1 << 30;

@@ -84,6 +84,11 @@ impl Transform {
     pub fn direction_to_world(&self, direction: DVec3) -> DVec3 {
         self.to_world.transform_vector3(direction) / self.voxel_size
     }
+
+    /// Index-space direction of a world direction: rotated, not scaled.
+    pub fn direction_to_index(&self, direction: DVec3) -> DVec3 {
+        self.to_index.transform_vector3(direction) * self.voxel_size
+    }
 }
 
 #[cfg(test)]

@@ -71,17 +71,43 @@ impl Volume {
         lerp(slab(0), slab(1), t.x) as f32
     }
 
-    /// World-space box around everything that is stored, with a voxel's rim; `None` if nothing is.
-    pub fn world_bounds(&self) -> Option<(DVec3, DVec3)> {
+    /// First and last voxel of everything that is stored; `None` if nothing is.
+    pub fn index_bounds(&self) -> Option<(IVec3, IVec3)> {
         let leaves = self.leaves.keys().map(|&o| (o, LEAF_DIM));
         let tiles = self.tiles.iter().flat_map(|(size, tiles)| tiles.keys().map(|&o| (o, *size)));
-        let boxes = leaves.chain(tiles).map(|(o, size)| (o - 1, o + size));
-        let (lo, hi) = boxes.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
+        let boxes = leaves.chain(tiles).map(|(o, size)| (o, o + (size - 1)));
+        boxes.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+    }
+
+    /// World-space box around everything that is stored, with a voxel's rim; `None` if nothing is.
+    pub fn world_bounds(&self) -> Option<(DVec3, DVec3)> {
+        let (lo, hi) = self.index_bounds()?;
+        let (lo, hi) = (lo - 1, hi + 1);
         let corners = (0..8).map(|i| {
             let pick = |axis: usize| if i >> axis & 1 == 1 { hi[axis] } else { lo[axis] };
             self.transform.voxel_to_world(IVec3::new(pick(0), pick(1), pick(2)))
         });
         corners.map(|p| (p, p)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+    }
+}
+
+/// Vectors on a lattice.
+pub struct VectorVolume {
+    /// Their components along the axes of the world.
+    pub components: [Volume; 3],
+    /// Whether component i lies half a voxel before the middle of its voxel along axis i, as solvers of fluids store it.
+    pub staggered: bool,
+}
+
+impl VectorVolume {
+    /// Trilinear interpolation at a world position.
+    pub fn trilinear(&self, xyz: DVec3) -> DVec3 {
+        let at = |axis: usize| {
+            let volume = &self.components[axis];
+            let shift = if self.staggered { volume.transform.to_world().matrix3.col(axis) * 0.5 } else { DVec3::ZERO };
+            f64::from(volume.trilinear(xyz + shift))
+        };
+        DVec3::new(at(0), at(1), at(2))
     }
 }
 
@@ -110,5 +136,22 @@ mod tests {
         assert_eq!(volume.trilinear(DVec3::splat(1e300)), 0.0);
         let (lo, hi) = volume.world_bounds().unwrap();
         assert_eq!((lo, hi), (DVec3::new(-0.5, -0.5, -64.5), DVec3::new(128.0, 64.0, 4.0)));
+    }
+
+    #[test]
+    fn staggered_components_lie_on_the_faces() {
+        let ramp = |axis: usize| {
+            let mut volume = Volume::new(Transform::uniform(0.5), 0.0);
+            let mut leaf = Box::new(LeafValues::default());
+            (0..512).for_each(|o| leaf.0[o] = crate::grid::offset_to_local(o)[axis] as f32);
+            volume.insert_leaf(IVec3::ZERO, leaf);
+            volume
+        };
+        let mut vectors = VectorVolume { components: [ramp(0), ramp(1), ramp(2)], staggered: false };
+        let p = DVec3::new(1.0, 1.5, 2.0);
+        assert_eq!(vectors.trilinear(p), DVec3::new(2.0, 3.0, 4.0));
+        vectors.staggered = true;
+        // The value of voxel i is that at i − ½.
+        assert_eq!(vectors.trilinear(p), DVec3::new(2.5, 3.5, 4.5));
     }
 }

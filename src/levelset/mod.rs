@@ -9,13 +9,16 @@ mod components;
 mod curvature;
 mod curve;
 pub(crate) mod dual;
+pub mod expression;
 mod field;
+mod geodesic;
 pub(crate) mod isosurface;
 mod lattice;
 pub(crate) mod marching;
 mod measure;
 pub(crate) mod sample;
 pub mod shapes;
+pub mod smooth_csg;
 mod sweep;
 #[cfg(test)]
 pub(crate) mod testing;
@@ -28,6 +31,7 @@ pub(crate) use build::{BYTES_A_LEAF, grid_of_leaves, grid_of_parts};
 pub use components::Components;
 pub use curvature::{CurvatureKind, curvature};
 pub use field::Field;
+pub use geodesic::Geodesic;
 pub use measure::Measures;
 pub use sample::{Interpolation, Sampler};
 pub use sweep::{extend_field, sweep_distance};
@@ -124,7 +128,7 @@ impl LevelSet {
 
     /// Reads φ at any point.
     pub fn sampler(&self) -> Sampler<'_> {
-        Sampler::new(self)
+        Sampler::new(&self.grid, self.voxel_size())
     }
 }
 

@@ -12,7 +12,7 @@ use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 
 use super::LevelSet;
-use crate::grid::Accessor;
+use crate::grid::{Accessor, Grid};
 
 /// Largest index-space coordinate at which a sample is looked up; beyond it everything is outside.
 const FARTHEST: f64 = (crate::grid::MAX_COORD - 2) as f64;
@@ -47,12 +47,19 @@ impl LevelSet {
 /// Reads φ between voxels. Positions are in index space; values are in world units. Remembers the last leaf.
 pub struct Sampler<'a> {
     accessor: Accessor<'a>,
-    level_set: &'a LevelSet,
+    voxel_size: f64,
+    background: f32,
 }
 
 impl<'a> Sampler<'a> {
-    pub(super) fn new(level_set: &'a LevelSet) -> Self {
-        Self { accessor: level_set.grid().accessor(), level_set }
+    /// A sampler of a field of distances whose voxels have this size.
+    pub(crate) fn new(grid: &'a Grid, voxel_size: f64) -> Self {
+        Self { accessor: grid.accessor(), voxel_size, background: grid.background() }
+    }
+
+    /// Edge of a voxel in world units.
+    pub(super) fn voxel_size(&self) -> f64 {
+        self.voxel_size
     }
 
     /// Value of a voxel.
@@ -63,7 +70,7 @@ impl<'a> Sampler<'a> {
     /// Trilinear interpolation of φ at an index-space position; exact on linear fields.
     #[inline]
     pub fn trilinear(&mut self, ijk: DVec3) -> f32 {
-        let Some((cell, t)) = split(ijk) else { return self.level_set.background() };
+        let Some((cell, t)) = split(ijk) else { return self.background };
         let c = self.accessor.cell(cell).map(f64::from);
         let lerp = |a: f64, b: f64, t: f64| a + (b - a) * t;
         let z: [f64; 4] = std::array::from_fn(|i| lerp(c[2 * i], c[2 * i + 1], t.z));
@@ -73,9 +80,9 @@ impl<'a> Sampler<'a> {
     /// φ (world units) and the gradient of its trilinear interpolant (dimensionless, index axes: a unit vector on a distance field).
     #[inline]
     pub fn value_and_gradient(&mut self, ijk: DVec3) -> (f32, DVec3) {
-        let Some((cell, t)) = split(ijk) else { return (self.level_set.background(), DVec3::ZERO) };
+        let Some((cell, t)) = split(ijk) else { return (self.background, DVec3::ZERO) };
         let (phi, gradient) = interpolate(self.accessor.cell(cell), t);
-        (phi as f32, gradient / self.level_set.voxel_size())
+        (phi as f32, gradient / self.voxel_size)
     }
 
     /// Triquadratic interpolation of φ at an index-space position; exact on quadratic fields.
@@ -89,30 +96,38 @@ impl<'a> Sampler<'a> {
     /// a field is sampled as the mirror image only within the error of the table above.
     #[inline]
     pub fn triquadratic(&mut self, ijk: DVec3) -> f32 {
-        let Some((cell, t)) = split(ijk) else { return self.level_set.background() };
+        let Some((cell, t)) = split(ijk) else { return self.background };
         interpolate_quadratic(self.accessor.block(cell), t).0 as f32
     }
 
     /// φ (world units) and the gradient of its triquadratic interpolant (dimensionless, index axes).
     #[inline]
     pub fn triquadratic_gradient(&mut self, ijk: DVec3) -> (f32, DVec3) {
-        let Some((cell, t)) = split(ijk) else { return (self.level_set.background(), DVec3::ZERO) };
+        let Some((cell, t)) = split(ijk) else { return (self.background, DVec3::ZERO) };
         let (phi, gradient) = interpolate_quadratic(self.accessor.block(cell), t);
-        (phi as f32, gradient / self.level_set.voxel_size())
+        (phi as f32, gradient / self.voxel_size)
     }
 
     /// Central-difference gradient at an index-space position, of the trilinear interpolant with a step of one voxel:
     /// smoother than [`value_and_gradient`](Self::value_and_gradient), whose gradient jumps between cells. Index axes, dimensionless.
     pub fn smooth_gradient(&mut self, ijk: DVec3) -> DVec3 {
         let mut along = |axis: DVec3| f64::from(self.trilinear(ijk + axis)) - f64::from(self.trilinear(ijk - axis));
-        DVec3::new(along(DVec3::X), along(DVec3::Y), along(DVec3::Z)) / (2.0 * self.level_set.voxel_size())
+        DVec3::new(along(DVec3::X), along(DVec3::Y), along(DVec3::Z)) / (2.0 * self.voxel_size)
+    }
+
+    /// Gradient of a voxel by central differences. Index axes, dimensionless.
+    pub fn voxel_gradient(&mut self, ijk: IVec3) -> DVec3 {
+        let mut along =
+            |axis: IVec3| f64::from(self.accessor.value(ijk + axis)) - f64::from(self.accessor.value(ijk - axis));
+        DVec3::new(along(IVec3::X), along(IVec3::Y), along(IVec3::Z)) / (2.0 * self.voxel_size)
     }
 
     /// The surface point closest to an index-space position within the band, by Newton's iteration
     /// x ← x − φ ∇φ/|∇φ|²; `None` where the field has no gradient or the iteration leaves the band.
     /// On a distance field two or three steps reach the accuracy of the interpolation.
     pub fn closest_point(&mut self, ijk: DVec3) -> Option<DVec3> {
-        let voxel_size = self.level_set.voxel_size();
+        let voxel_size = self.voxel_size;
+        let half_width = f64::from(self.background) / voxel_size;
         let mut x = ijk;
         for _ in 0..10 {
             let (phi, gradient) = self.value_and_gradient(x);
@@ -125,7 +140,7 @@ impl<'a> Sampler<'a> {
                 return None;
             }
             x -= gradient * (phi / squared);
-            if (x - ijk).length() > 2.0 * f64::from(self.level_set.half_width()) + 1.0 {
+            if (x - ijk).length() > 2.0 * half_width + 1.0 {
                 return None;
             }
         }

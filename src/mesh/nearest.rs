@@ -72,19 +72,25 @@ enum Side {
 }
 
 /// A leaf with its first voxel.
-pub(super) type Leaf = (IVec3, LeafValues, LeafMask);
+pub(crate) type Leaf = (IVec3, LeafValues, LeafMask);
 
-/// The leaves of a band, those of each tile together, tiles in the order of their origins.
+/// The leaves of a band, those of each tile together, tiles in the order of their origins; only of those tiles for whose first and last
+/// voxel `wanted` holds.
 pub(super) fn leaves_of_band(
     operation: &str,
     surface: &IsoSurface,
     field: &Grid,
     iso: f32,
     band: Band,
+    wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
     run: &RunOptions,
 ) -> Result<Vec<Vec<Leaf>>> {
     let search = Search { sources: Sources::new(surface, field), surface, field, iso, band };
-    let tiles = search.sources.tiles_within(band.reach());
+    let mut tiles = search.sources.tiles_within(band.reach());
+    tiles.retain(|&tile| {
+        let (first, last) = tile_bounds(tile);
+        wanted(first, last)
+    });
     let task = run.task("distances", tiles.len() as u64);
     let made = AtomicU64::new(0);
     tiles

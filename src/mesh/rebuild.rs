@@ -7,10 +7,12 @@
 //! distance: no steps, no error that grows with the distance.
 
 use glam::{DVec3, IVec3};
+use rayon::prelude::*;
+use rustc_hash::FxHashSet;
 
 use super::from_levelset::{leaves_the_band, surface_of};
-use super::nearest::{Band, leaves_of_band};
-use super::{Bvh, MeshToLevelSet, level_set_to_mesh, mesh_to_level_set};
+use super::nearest::{Band, Leaf, leaves_of_band};
+use super::{Bvh, MeshToLevelSet, TriangleMesh, level_set_to_mesh, mesh_to_level_set};
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, MAX_COORD, Transform};
 use crate::levelset::isosurface::IsoSurface;
@@ -72,8 +74,57 @@ pub fn rebuild(level_set: &LevelSet, what: &Rebuild, run: &RunOptions) -> Result
     }
     let background = background(half_width, &transform);
     let band = Band { offset, half_width: f64::from(half_width), voxel_size, background };
-    let leaves = leaves_of_band(OPERATION, &surface, level_set.grid(), iso, band, run)?;
+    let leaves = leaves_of_band(OPERATION, &surface, level_set.grid(), iso, band, |_, _| true, run)?;
     Ok(LevelSet::new(grid_of_parts(background, &leaves), transform))
+}
+
+/// The level set with exact distances beyond its band, up to `half_width` voxels from the surface, wherever `wanted` holds for the first and
+/// last voxel of a box that is near the surface. The voxels of its own band keep their bits.
+///
+/// The rebuilt distances are those of polygons, the others what they were: where the two meet they differ by the error of the polygons.
+pub fn widened(
+    level_set: &LevelSet,
+    half_width: f32,
+    wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
+    run: &RunOptions,
+) -> Result<LevelSet> {
+    if level_set.half_width() >= half_width || level_set.grid().leaves().is_empty() {
+        return Ok(level_set.clone());
+    }
+    let (transform, field) = (*level_set.transform(), level_set.grid());
+    let background = background(half_width, &transform);
+    let mut parts = rebuilt_leaves(level_set, half_width, wanted, run)?;
+    parts.par_iter_mut().flatten().for_each(|(origin, values, mask)| {
+        let own = field.find(*origin);
+        for at in field.mask(own).iter() {
+            values.0[at] = field.values(own).0[at];
+            mask.set(at, true);
+        }
+    });
+    let made: FxHashSet<IVec3> = parts.iter().flatten().map(|leaf| leaf.0).collect();
+    let kept = field.leaves().par_iter().filter(|&&id| !made.contains(&field.origin(id))).map(|&id| {
+        let (mut values, mask) = (field.values(id).clone(), field.mask(id));
+        for at in mask.zip(mask, |active, _| !active).iter() {
+            values.0[at] = if values.0[at] < 0.0 { -background } else { background };
+        }
+        (field.origin(id), values, mask)
+    });
+    parts.push(kept.collect());
+    Ok(LevelSet::new(grid_of_parts(background, &parts), transform))
+}
+
+/// The leaves of a band of `half_width` voxels with exact distances, of boxes for whose first and last voxel `wanted` holds.
+pub(crate) fn rebuilt_leaves(
+    level_set: &LevelSet,
+    half_width: f32,
+    wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
+    run: &RunOptions,
+) -> Result<Vec<Vec<Leaf>>> {
+    let transform = level_set.transform();
+    let background = background(half_width, transform);
+    let surface = surface_of(level_set, 0.0, OPERATION, run)?;
+    let band = Band { offset: 0.0, half_width: half_width.into(), voxel_size: transform.voxel_size(), background };
+    leaves_of_band(OPERATION, &surface, level_set.grid(), 0.0, band, wanted, run)
 }
 
 /// The same by looking up the closest triangle in a tree, voxel by voxel.
@@ -104,7 +155,16 @@ pub fn onto_lattice(level_set: &LevelSet, target: &Transform, half_width: f32, r
     if let Some(renamed) = level_set.renamed(target) {
         return with_half_width(&renamed, half_width, run);
     }
-    let mut mesh = level_set_to_mesh(level_set, 0.0, run)?;
+    level_set_of_mesh(level_set_to_mesh(level_set, 0.0, run)?, target, half_width, run)
+}
+
+/// The level set of a mesh (world units) on a given lattice; empty if it has no triangles.
+pub fn level_set_of_mesh(
+    mut mesh: TriangleMesh,
+    target: &Transform,
+    half_width: f32,
+    run: &RunOptions,
+) -> Result<LevelSet> {
     if mesh.triangles.is_empty() {
         return Ok(LevelSet::empty(*target, half_width));
     }

@@ -11,10 +11,12 @@ use fearless_simd::{Select, Simd, SimdBase, SimdMask};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::params::words;
+use super::params::{WorldLength, words};
 use super::registry::{Arity, Operator, Outcome, Summary};
-use crate::error::Result;
+use super::smooth_csg::{SmoothCsg, smooth_csg};
+use crate::error::{EditError, Result};
 use crate::grid::{Combination, Grid, LeafMask, LeafValues, SignRule};
+use crate::levelset::smooth_csg::{BlendForm, Combine};
 use crate::levelset::{LevelSet, background};
 use crate::mesh::{Rebuild, onto_lattice, rebuild, with_half_width};
 use crate::run::RunOptions;
@@ -32,19 +34,120 @@ words! {
     }
 }
 
-/// Unite, intersect or subtract level sets.
+words! {
+    /// What `csg` makes.
+    CsgKind {
+        /// What is in any of them: paste.
+        Union = "union",
+        /// What is in all of them: copy.
+        Intersection = "intersection",
+        /// What is in the first and in none of the others: cut.
+        Difference = "difference",
+        /// A union with rounded edges.
+        SmoothUnion = "smooth-union",
+        /// An intersection with rounded edges.
+        SmoothIntersection = "smooth-intersection",
+        /// A difference with rounded edges.
+        SmoothDifference = "smooth-difference",
+    }
+}
+
+impl CsgKind {
+    /// The plain operation, and the smooth one if the edges are rounded.
+    fn parts(self) -> (CsgOperation, Option<Combine>) {
+        match self {
+            Self::Union => (CsgOperation::Union, None),
+            Self::Intersection => (CsgOperation::Intersection, None),
+            Self::Difference => (CsgOperation::Difference, None),
+            Self::SmoothUnion => (CsgOperation::Union, Some(Combine::Union)),
+            Self::SmoothIntersection => (CsgOperation::Intersection, Some(Combine::Intersection)),
+            Self::SmoothDifference => (CsgOperation::Difference, Some(Combine::Difference)),
+        }
+    }
+}
+
+words! {
+    /// The form of rounded edges.
+    SmoothFunction {
+        /// Bounded: nothing changes where all other surfaces are a radius away.
+        SuperElliptic = "superelliptic",
+        /// Sum of densities.
+        Exponential = "exponential",
+        /// Branch of a hyperbola.
+        Hyperbolic = "hyperbolic",
+        /// R-function: edges stay sharp, the field off the surface is smooth.
+        R = "r",
+    }
+}
+
+/// Unite, intersect or subtract level sets, with sharp or with rounded edges.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Csg {
     /// What to do with the second and further inputs.
-    pub operation: CsgOperation,
-    /// Make the result an exact distance again. Without it the result is the plain minimum or maximum of the fields.
+    pub operation: CsgKind,
+    /// Of smooth operations: the radius of a circular fillet as deep as the blend in a right-angled edge.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub radius: Option<WorldLength>,
+    /// Of smooth operations, superelliptic if not given: `superelliptic` is exactly circular in right-angled edges and leaves alone what is farther than the radius from all other surfaces;
+    /// `exponential` and `hyperbolic` reach farther; `r` keeps the edge sharp.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub function: Option<SmoothFunction>,
+    /// Of smooth operations: blend in full up to the first distance from where surfaces meet, not at all beyond the second, in voxels; so surfaces that come near each other without meeting are not joined.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub near_curve: Option<[f64; 2]>,
+    /// Make the result an exact distance again. Without it the result is the plain minimum or maximum of the fields, but for exact distances around rounded edges.
     pub rebuild: bool,
 }
 
 impl Default for Csg {
     fn default() -> Self {
-        Self { operation: CsgOperation::Union, rebuild: false }
+        Self { operation: CsgKind::Union, radius: None, function: None, near_curve: None, rebuild: false }
+    }
+}
+
+impl Csg {
+    /// The smooth operation that is meant, if it is one, on voxels of a size.
+    fn smooth(&self, voxel_size: f64) -> Result<Option<SmoothCsg>> {
+        let refuse =
+            |field: &str, value: String, accepted: &str| Err(EditError::parameter(Self::NAME, field, value, accepted));
+        let Some(combine) = self.operation.parts().1 else {
+            let only = "only with smooth-union, smooth-intersection and smooth-difference";
+            if let Some(radius) = self.radius {
+                return refuse("radius", radius.to_string(), only);
+            }
+            if let Some([a, b]) = self.near_curve {
+                return refuse("near_curve", format!("{a},{b}"), only);
+            }
+            return match self.function {
+                Some(function) => refuse("function", format!("{function:?}").to_lowercase(), only),
+                None => Ok(None),
+            };
+        };
+        let function = self.function.unwrap_or(SmoothFunction::SuperElliptic);
+        let form = match (function, self.radius) {
+            (SmoothFunction::R, None) => BlendForm::R { alpha: 0.0, order: 0 },
+            (SmoothFunction::R, Some(radius)) => {
+                return refuse("radius", radius.to_string(), "none with the function `r`, which keeps edges sharp");
+            }
+            (_, None) => return refuse("radius", "none".into(), "a length, such as 0.1 or 5vx"),
+            (function, Some(radius)) => {
+                let radius = radius.world(voxel_size);
+                match function {
+                    SmoothFunction::Exponential => BlendForm::Exponential { radius },
+                    SmoothFunction::Hyperbolic => BlendForm::Hyperbolic { radius },
+                    _ => BlendForm::SuperElliptic { radius, exponent: 2.0 },
+                }
+            }
+        };
+        form.validate(Self::NAME)?;
+        if let Some([a, b]) = self.near_curve
+            && !(0.0 <= a && a <= b && b > 0.0 && b.is_finite())
+        {
+            return refuse("near_curve", format!("{a},{b}"), "two distances in voxels, the smaller first, such as 7,9");
+        }
+        let near_curve = self.near_curve.map(|reach| reach.map(|d| d * voxel_size));
+        Ok(Some(SmoothCsg { combine, form, near_curve }))
     }
 }
 
@@ -53,14 +156,20 @@ impl Operator for Csg {
     const ARITY: Arity = Arity::Many;
 
     fn validate(&self) -> Result<()> {
-        Ok(())
+        self.smooth(1.0).map(drop)
     }
 
     fn apply(&self, inputs: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
-        let (aligned, warnings) = align(inputs, run)?;
+        let (aligned, mut warnings) = align(inputs, run)?;
         let Some((first, others)) = aligned.split_first() else { unreachable!("the registry counts the inputs") };
         let others: Vec<&LevelSet> = others.iter().collect();
-        let mut result = csg(first, &others, self.operation, run)?;
+        let mut result = csg(first, &others, self.operation.parts().0, run)?;
+        if let Some(what) = self.smooth(first.voxel_size())? {
+            let operands: Vec<&LevelSet> = aligned.iter().collect();
+            let (smooth, more) = smooth_csg(&operands, &result, &what, run)?;
+            result = smooth;
+            warnings.extend(more);
+        }
         if self.rebuild {
             result = rebuild(&result, &Rebuild::band(result.half_width()), run)?;
         }

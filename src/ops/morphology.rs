@@ -6,13 +6,17 @@
 //!
 //! Each step is one rebuild ([`crate::mesh::rebuild`]): exact distances to the polygonised surface, at any distance,
 //! no stepping; `offset --like openvdb` takes steps, to compare. Eroding everything away leaves an empty level set, which is legal.
+//!
+//! In a region the result is φ' = (1 − α) φ + α φ_new, made a distance again around it. The surface moves by α times the distance, so
+//! a feathered region leaves a slope from where it begins to where it is full.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::confine::{Reach, confined};
 use super::params::WorldLength;
 use super::registry::{Arity, Operator, Outcome, Summary};
-use super::solver::{Like, evolved};
+use super::solver::{Like, RegionSpecs, evolved};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{Rebuild, rebuild};
@@ -34,22 +38,41 @@ fn validate(operation: &str, distance: WorldLength, least: f64) -> Result<()> {
     Err(EditError::parameter(operation, "distance", distance, accepted))
 }
 
-/// Moves the surface by the distance times each of `signs` in turn.
+/// Moves the surface by the distance times each of `signs` in turn, everywhere or in a region.
 fn moved(
     operation: &str,
-    inputs: Vec<LevelSet>,
+    mut inputs: Vec<LevelSet>,
     distance: WorldLength,
     signs: &[f64],
+    region: &RegionSpecs,
     run: &RunOptions,
 ) -> Result<Outcome> {
     let mut summary = Summary::default();
-    let mut result = inputs.into_iter().next().unwrap_or_else(|| unreachable!("the registry counts the inputs"));
-    let length = distance.world(result.voxel_size());
-    let was_empty = result.is_empty();
-    for sign in signs {
-        run.check(operation)?;
-        result = offset(&result, sign * length, run)?;
-    }
+    let input = inputs.remove(0);
+    let was_empty = input.is_empty();
+    let length = distance.world(input.voxel_size());
+    let all = |level_set: LevelSet| {
+        signs.iter().try_fold(level_set, |level_set, sign| {
+            run.check(operation)?;
+            offset(&level_set, sign * length, run)
+        })
+    };
+    let result = match region.on(&input, run)? {
+        None => all(input)?,
+        Some(region) => {
+            let moves = length.abs() / input.voxel_size();
+            let reach = Reach { moves, sees: moves * signs.len() as f64 };
+            let changed = confined(operation, &input, &*region, &reach, all, run)?;
+            changed.unwrap_or_else(|| {
+                if !was_empty {
+                    summary.warnings.push(format!(
+                        "the region touches nothing within {distance} of the surface: nothing was changed"
+                    ));
+                }
+                input
+            })
+        }
+    };
     if result.is_empty() && !was_empty {
         let warning = format!("nothing is left: every part is thinner than twice the distance {distance}");
         summary.warnings.push(warning);
@@ -67,12 +90,14 @@ pub struct Offset {
     /// each, which is not exact.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub like: Option<Like>,
+    /// Where to move it, and which part of the way; everywhere if not given.
+    pub region: RegionSpecs,
 }
 
 impl Default for Offset {
     /// One voxel.
     fn default() -> Self {
-        Self { distance: WorldLength::voxel(), like: None }
+        Self { distance: WorldLength::voxel(), like: None, region: RegionSpecs::default() }
     }
 }
 
@@ -81,15 +106,17 @@ impl Operator for Offset {
     const ARITY: Arity = Arity::One;
 
     fn validate(&self) -> Result<()> {
-        validate(Self::NAME, self.distance, f64::NEG_INFINITY)
+        validate(Self::NAME, self.distance, f64::NEG_INFINITY)?;
+        self.region.validate()
     }
 
     fn apply(&self, mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
         match self.like {
-            None => moved(Self::NAME, inputs, self.distance, &[1.0], run),
+            None => moved(Self::NAME, inputs, self.distance, &[1.0], &self.region, run),
             Some(Like::OpenVdb) => evolved(inputs.remove(0), run, |level_set| {
                 let distance = self.distance.world(level_set.voxel_size());
-                pde::offset(level_set, distance, None, &SolverOptions::OPENVDB, run)
+                let region = self.region.on(level_set, run)?;
+                pde::offset(level_set, distance, region.as_deref(), &SolverOptions::OPENVDB, run)
             }),
         }
     }
@@ -104,12 +131,14 @@ macro_rules! morphology {
         pub struct $name {
             /// How far the surface moves.
             pub distance: WorldLength,
+            /// Where to act, and how strongly; everywhere if not given.
+            pub region: RegionSpecs,
         }
 
         impl Default for $name {
             /// One voxel.
             fn default() -> Self {
-                Self { distance: WorldLength::voxel() }
+                Self { distance: WorldLength::voxel(), region: RegionSpecs::default() }
             }
         }
 
@@ -118,11 +147,12 @@ macro_rules! morphology {
             const ARITY: Arity = Arity::One;
 
             fn validate(&self) -> Result<()> {
-                validate(Self::NAME, self.distance, 0.0)
+                validate(Self::NAME, self.distance, 0.0)?;
+                self.region.validate()
             }
 
             fn apply(&self, inputs: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
-                moved(Self::NAME, inputs, self.distance, &$signs, run)
+                moved(Self::NAME, inputs, self.distance, &$signs, &self.region, run)
             }
         }
     };
@@ -208,8 +238,8 @@ mod tests {
         let w = 5.0;
         let apply = |o: &dyn Fn() -> Result<Outcome>| o().unwrap().level_set;
         let distance = WorldLength::new(w * 0.5);
-        let opened = apply(&|| Open { distance }.apply(vec![cube.clone()], &run));
-        let closed = apply(&|| Close { distance }.apply(vec![cube.clone()], &run));
+        let opened = apply(&|| Open { distance, ..Open::default() }.apply(vec![cube.clone()], &run));
+        let closed = apply(&|| Close { distance, ..Close::default() }.apply(vec![cube.clone()], &run));
         // The polygonised box loses up to half a voxel at its edges, and no more than that elsewhere.
         assert!(worst(&opened, |p| box_distance(p, half - w) - w) < 0.6);
         let s: f64 = 2.0 * (16.3 - w);
@@ -218,6 +248,10 @@ mod tests {
             + 3.0 * std::f64::consts::PI * s * w * w
             + 4.0 / 3.0 * std::f64::consts::PI * w.powi(3);
         let measured = opened.measure(&run).unwrap().volume / 0.125;
+        // A corner retreats by (√3 − 1) w along its diagonal, 3.660 voxels.
+        let corner = half.length() - (3f64.sqrt() - 1.0) * w;
+        let at_corner = f64::from(opened.sampler().trilinear(DVec3::ONE.normalize() * corner)) / 0.5;
+        assert!(at_corner.abs() < 0.6, "{at_corner}");
         // The polygons cut the twelve edges of the eroded box off at up to half a voxel, and the dilation carries that outwards.
         assert!((measured / volume - 1.0).abs() < 0.015, "{measured} {volume}");
         let before = cube.measure(&run).unwrap().volume;
@@ -232,24 +266,178 @@ mod tests {
             plate.min(box_distance(p - DVec3::new(20.0, 0.0, 0.0), DVec3::new(20.0, 2.2, 2.2)))
         });
         let distance = "3vx".parse().unwrap();
-        let opened = Open { distance }.apply(vec![thin.clone()], &run).unwrap().level_set;
+        let opened = Open { distance, ..Open::default() }.apply(vec![thin.clone()], &run).unwrap().level_set;
         assert!(opened.grid().voxel(IVec3::new(30, 0, 0)).0 > 0.0 && opened.grid().voxel(IVec3::ZERO).0 < 0.0);
-        let closed = Close { distance }.apply(vec![thin], &run).unwrap().level_set;
+        let closed = Close { distance, ..Close::default() }.apply(vec![thin], &run).unwrap().level_set;
         assert!(closed.grid().voxel(IVec3::new(30, 0, 0)).0 < 0.0);
+        // What stays of the bar is the cap of a ball that leans out of its root: to 12 − √(3² − 2.2²) + 3.
+        let tip = 15.0 - (9.0f64 - 2.2 * 2.2).sqrt();
+        let at_tip = f64::from(opened.sampler().trilinear(DVec3::new(tip, 0.0, 0.0))) / 0.5;
+        // The polygons fill the rim of the hole by up to half a voxel each way; the tip moves by that and by 2.2 / 2.04 of it.
+        assert!(at_tip.abs() < 1.05, "{at_tip}");
         let gap = level_set(40, |p| {
             box_distance(p - DVec3::new(0.0, 0.0, 12.0), DVec3::splat(10.0))
                 .min(box_distance(p + DVec3::new(0.0, 0.0, 12.0), DVec3::splat(10.0)))
         });
-        assert!(gap.grid().voxel(IVec3::ZERO).0 > 0.0);
-        let closed = Close { distance }.apply(vec![gap], &run).unwrap().level_set;
+        let opened = Open { distance, ..Open::default() }.apply(vec![gap.clone()], &run).unwrap().level_set;
+        assert!((opened.grid().voxel(IVec3::ZERO).0 / 0.5 - 2.0).abs() < 0.1, "opening leaves the gap of 4");
+        let closed = Close { distance, ..Close::default() }.apply(vec![gap], &run).unwrap().level_set;
         assert!(closed.grid().voxel(IVec3::ZERO).0 < 0.0);
+        // Around the waist the ball of 3 that touches both edges sinks in by 3 − √(3² − 2²).
+        let waist = 7.0 + 5f64.sqrt();
+        let at_waist = f64::from(closed.sampler().trilinear(DVec3::new(waist, 0.0, 0.0))) / 0.5;
+        // The polygons cut the edges by up to half a voxel each way.
+        assert!(at_waist.abs() < 1.0, "{at_waist}");
+    }
+
+    /// Morphology in a region: name, parameters and what it should do to the far half of a body.
+    fn in_region(input: &LevelSet, name: &str, distance: &str, region: &str) -> Outcome {
+        let values = serde_json::json!({ "distance": distance, "region": region });
+        let values = values.as_object().unwrap().clone();
+        super::super::find(name).unwrap().run(values, vec![input.clone()], &RunOptions::default()).unwrap()
+    }
+
+    /// Voxels that were active with weight 0 keep their bits; returns how many voxels changed.
+    fn assert_kept(before: &LevelSet, after: &LevelSet, region: &str) -> u64 {
+        let run = RunOptions::default();
+        let region = RegionSpecs(vec![region.into()]).on(before, &run).unwrap().unwrap();
+        let (mut kept, mut changed) = (0, 0);
+        for &id in before.grid().leaves() {
+            for at in before.grid().mask(id).iter() {
+                let ijk = before.grid().origin(id) + offset_to_local(at);
+                let (value, active) = after.grid().voxel(ijk);
+                let same = active && value.to_bits() == before.grid().values(id).0[at].to_bits();
+                if region.weight(before.transform().voxel_to_world(ijk)) == 0.0 {
+                    assert!(same, "{ijk}");
+                    kept += 1;
+                } else {
+                    changed += u64::from(!same);
+                }
+            }
+        }
+        assert!(kept > 1000);
+        changed
+    }
+
+    #[test]
+    fn in_a_region_the_surface_moves_by_alpha_times_the_distance() {
+        // A slab whose upper face is the plane z = 2 (voxels), dilated by 6 under a feathered ball.
+        let plate = level_set(44, |p| box_distance(p, DVec3::new(36.0, 36.0, 8.0)));
+        let region = "sphere center=0,0,4 radius=14 soft=0.25,1";
+        let outcome = in_region(&plate, "dilate", "6vx", region);
+        assert!(assert_kept(&plate, &outcome.level_set, region) > 1000);
+        assert!(outcome.level_set.check().is_empty(), "{:?}", outcome.level_set.check());
+        // Along the axis: full weight within a quarter of the radius, so the surface is at 8 + 6; the height over a point of the plane
+        // solves z − 8 = 6 α(x, z).
+        let mut sampler = outcome.level_set.sampler();
+        let sphere = RegionSpecs(vec![region.into()]).on(&plate, &RunOptions::default()).unwrap().unwrap();
+        for x in [0.0, 4.0, 8.0, 12.0, 16.0, 20.0] {
+            let alpha = |z: f64| f64::from(sphere.weight(DVec3::new(x, 0.0, z) * 0.5));
+            let (mut lo, mut hi) = (8.0f64, 14.5);
+            for _ in 0..40 {
+                let z = (lo + hi) / 2.0;
+                if z - 8.0 < 6.0 * alpha(z) { lo = z } else { hi = z }
+            }
+            let phi = f64::from(sampler.trilinear(DVec3::new(x, 0.0, lo))) / 0.5;
+            assert!(phi.abs() < 0.1, "{x}: {phi} at {lo}");
+        }
+        assert_eq!(outcome.level_set.measure(&RunOptions::default()).unwrap().euler, 2);
+    }
+
+    #[test]
+    fn a_steep_region_on_a_large_offset_is_a_valid_surface() {
+        let ball = level_set(30, |p| (p - DVec3::new(0.3, 0.1, -0.2)).length() - 20.0);
+        for (name, distance) in [("dilate", "12vx"), ("erode", "9vx"), ("open", "6vx"), ("close", "12vx")] {
+            for region in
+                ["box center=10,0,0 size=10,8,8 soft=1,1", "box center=10,0,0 size=10,8,8", "halfspace normal=1,1,0"]
+            {
+                let outcome = in_region(&ball, name, distance, region);
+                assert_kept(&ball, &outcome.level_set, region);
+                let found = outcome.level_set.check();
+                assert!(found.is_empty(), "{name} {region}: {found:?}");
+                let measured = outcome.level_set.measure(&RunOptions::default()).unwrap();
+                let before = ball.measure(&RunOptions::default()).unwrap();
+                match name {
+                    "dilate" => assert!(measured.volume > 1.05 * before.volume, "{region} {}", measured.volume),
+                    "erode" => assert!(measured.volume < 0.97 * before.volume, "{region} {}", measured.volume),
+                    // A ball is its own opening and closing, within 0.05 voxel.
+                    _ => assert!((measured.volume / before.volume - 1.0).abs() < 3.0 * 0.05 / 20.0, "{name} {region}"),
+                }
+                assert_eq!((measured.components, measured.euler), (1, 2), "{name} {region}");
+            }
+        }
+    }
+
+    #[test]
+    fn everywhere_as_a_region_is_no_region_and_nowhere_changes_nothing() {
+        let run = RunOptions::default();
+        let ball = level_set(30, |p| p.length() - 20.0);
+        let all = in_region(&ball, "dilate", "7vx", "sphere radius=100 soft=1,1").level_set;
+        let plain = Dilate { distance: "7vx".parse().unwrap(), ..Dilate::default() };
+        let plain = plain.apply(vec![ball.clone()], &run).unwrap().level_set;
+        assert!((all.measure(&run).unwrap().volume / plain.measure(&run).unwrap().volume - 1.0).abs() < 1e-3);
+        assert!(worst(&all, |p| p.length() - 27.0) < 0.375 / 20.0 * 3.0);
+        let none = in_region(&ball, "open", "2vx", "sphere center=90,0,0 radius=3");
+        assert!(none.summary.warnings[0].contains("nothing was changed"), "{:?}", none.summary);
+        assert_kept(&ball, &none.level_set, "sphere center=90,0,0 radius=3");
+    }
+
+    #[test]
+    fn opening_shrinks_closing_grows_and_both_are_idempotent() {
+        let run = RunOptions::default();
+        // Two balls that overlap, and what they have in common: a concave edge for closing to fill, a convex one for opening to round.
+        let balls = |p: DVec3| [(p - DVec3::X * 7.0).length() - 12.0, (p + DVec3::X * 7.0).length() - 14.0];
+        let distance = "3vx".parse().unwrap();
+        for open in [true, false] {
+            let body =
+                level_set(30, |p| if open { balls(p)[0].max(balls(p)[1]) } else { balls(p)[0].min(balls(p)[1]) });
+            // Neither is a distance everywhere.
+            let body = rebuild(&body, &Rebuild::band(3.0), &run).unwrap();
+            let apply = |input: &LevelSet| match open {
+                true => Open { distance, ..Open::default() }.apply(vec![input.clone()], &run).unwrap().level_set,
+                false => Close { distance, ..Close::default() }.apply(vec![input.clone()], &run).unwrap().level_set,
+            };
+            let once = apply(&body);
+            let twice = apply(&once);
+            let sign = if open { 1.0 } else { -1.0 };
+            let mut sampler = once.sampler();
+            let mut moved = 0;
+            for (ijk, value) in body.band_voxels() {
+                // φ_open ≥ φ and φ_close ≤ φ, but for the polygons.
+                let grown = sign * (sampler.voxel(ijk) - value) / 0.5;
+                assert!(grown > -0.1, "{open} {ijk}: {grown}");
+                moved += i32::from(grown > 0.3);
+            }
+            assert!(moved > 100, "the edge is rounded: {moved}");
+            let mut again = twice.sampler();
+            // Within a tenth of a voxel, but for the rim: between the two steps it is sharp, and the polygons cut it.
+            let beside: Vec<_> = once.band_voxels().into_iter().filter(|(_, value)| value.abs() < 0.5).collect();
+            let difference = |(ijk, value): &(IVec3, f32)| f64::from(again.voxel(*ijk) - value).abs() / 0.5;
+            let mut differences: Vec<f64> = beside.iter().map(difference).collect();
+            differences.sort_by(f64::total_cmp);
+            let (most, nearly_all) = (differences[differences.len() - 1], differences[differences.len() * 97 / 100]);
+            assert!(nearly_all < 0.1 && most < 0.5, "{open}: {nearly_all} {most}");
+        }
+    }
+
+    impl LevelSet {
+        /// Active voxels with their values.
+        fn band_voxels(&self) -> Vec<(IVec3, f32)> {
+            let grid = self.grid();
+            let voxels =
+                |id| grid.mask(id).iter().map(move |at| (grid.origin(id) + offset_to_local(at), grid.values(id).0[at]));
+            grid.leaves().iter().copied().flat_map(voxels).collect()
+        }
     }
 
     #[test]
     fn negative_distances_are_for_offset_only() {
         let distance = WorldLength::new(-1.0);
-        assert!(Offset { distance, like: None }.validate().is_ok());
-        assert!(Dilate { distance }.validate().is_err() && Open { distance }.validate().is_err());
-        assert!(Offset { distance: WorldLength::new(f64::NAN), like: None }.validate().is_err());
+        assert!(Offset { distance, ..Offset::default() }.validate().is_ok());
+        assert!(
+            Dilate { distance, ..Dilate::default() }.validate().is_err()
+                && Open { distance, ..Open::default() }.validate().is_err()
+        );
+        assert!(Offset { distance: WorldLength::new(f64::NAN), ..Offset::default() }.validate().is_err());
     }
 }

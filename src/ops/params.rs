@@ -83,7 +83,12 @@ macro_rules! length {
 
             /// One voxel, whatever its size.
             pub const fn voxel() -> Self {
-                Self(Quantity { value: 1.0, unit: Some(Unit::Voxels) })
+                Self::in_voxels(1.0)
+            }
+
+            /// So many voxels, whatever their size.
+            pub const fn in_voxels(value: f64) -> Self {
+                Self(Quantity { value, unit: Some(Unit::Voxels) })
             }
 
             /// In world units.

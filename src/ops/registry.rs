@@ -95,39 +95,26 @@ pub struct Parameter {
     pub is_flag: bool,
 }
 
-/// An operator in the registry.
-pub struct Entry {
-    /// Its name.
-    pub name: &'static str,
-    /// What it takes.
-    pub arity: Arity,
+/// What there is to know of a struct of parameters.
+pub struct ParameterSet {
     schema: fn() -> Schema,
     defaults: fn() -> Value,
-    run: RunFn,
     check: fn(Map<String, Value>) -> Result<()>,
 }
 
-type RunFn = fn(Map<String, Value>, Vec<LevelSet>, &RunOptions) -> Result<Outcome>;
-
-impl Entry {
-    const fn of<O: Operator>() -> Self {
+impl ParameterSet {
+    /// Of `P`, whose values `check` verifies.
+    pub(crate) const fn of<P: Default + Serialize + JsonSchema>(check: fn(Map<String, Value>) -> Result<()>) -> Self {
         Self {
-            name: O::NAME,
-            arity: O::ARITY,
-            schema: || schema_for!(O),
-            defaults: || serde_json::to_value(O::default()).unwrap_or(Value::Null),
-            run: |values, inputs, run| {
-                let operator: O = parse(values)?;
-                operator.validate()?;
-                operator.apply(inputs, run)
-            },
-            check: |values| parse::<O>(values)?.validate(),
+            schema: || schema_for!(P),
+            defaults: || serde_json::to_value(P::default()).unwrap_or(Value::Null),
+            check,
         }
     }
 
-    /// What the operator does: the doc comment of its struct.
+    /// What it is for: the doc comment of the struct.
     pub fn help(&self) -> String {
-        (self.schema)().get("description").and_then(Value::as_str).unwrap_or_default().to_owned()
+        self.schema().get("description").and_then(Value::as_str).unwrap_or_default().to_owned()
     }
 
     /// Its JSON schema.
@@ -135,9 +122,9 @@ impl Entry {
         (self.schema)()
     }
 
-    /// Its parameters in the order of the struct.
-    pub fn parameters(&self) -> Vec<Parameter> {
-        let schema = (self.schema)();
+    /// The parameters in the order of the struct.
+    pub fn list(&self) -> Vec<Parameter> {
+        let schema = self.schema();
         let defaults = (self.defaults)();
         let Some(properties) = schema.get("properties").and_then(Value::as_object) else { return Vec::new() };
         properties
@@ -156,6 +143,58 @@ impl Entry {
     /// Verifies parameters without doing anything.
     pub fn check(&self, values: Map<String, Value>) -> Result<()> {
         (self.check)(values)
+    }
+}
+
+/// An operator in the registry.
+pub struct Entry {
+    /// Its name.
+    pub name: &'static str,
+    /// What it takes.
+    pub arity: Arity,
+    set: ParameterSet,
+    run: RunFn,
+}
+
+type RunFn = fn(Map<String, Value>, Vec<LevelSet>, &RunOptions) -> Result<Outcome>;
+
+impl Entry {
+    const fn of<O: Operator>() -> Self {
+        Self {
+            name: O::NAME,
+            arity: O::ARITY,
+            set: ParameterSet::of::<O>(|values| parse::<O>(O::NAME, values)?.validate()),
+            run: |values, inputs, run| {
+                let operator: O = parse(O::NAME, values)?;
+                operator.validate()?;
+                operator.apply(inputs, run)
+            },
+        }
+    }
+
+    /// All that there is to know of its parameters.
+    pub fn set(&self) -> &ParameterSet {
+        &self.set
+    }
+
+    /// What the operator does: the doc comment of its struct.
+    pub fn help(&self) -> String {
+        self.set.help()
+    }
+
+    /// Its JSON schema.
+    pub fn schema(&self) -> Schema {
+        self.set.schema()
+    }
+
+    /// Its parameters in the order of the struct.
+    pub fn parameters(&self) -> Vec<Parameter> {
+        self.set.list()
+    }
+
+    /// Verifies parameters without doing anything.
+    pub fn check(&self, values: Map<String, Value>) -> Result<()> {
+        self.set.check(values)
     }
 
     /// Runs the operator with the given parameters over its defaults.
@@ -180,9 +219,14 @@ impl Entry {
 /// All operators, in the order of the manual.
 pub static REGISTRY: &[Entry] = &[
     Entry::of::<super::shape::Shape>(),
+    Entry::of::<super::segment::Segment>(),
     Entry::of::<super::transform::TransformOperator>(),
     Entry::of::<super::csg::Csg>(),
     Entry::of::<super::smooth::Smooth>(),
+    Entry::of::<super::emboss::Emboss>(),
+    Entry::of::<super::warp::Warp>(),
+    Entry::of::<super::sweep::Sweep>(),
+    Entry::of::<super::advect::Advect>(),
     Entry::of::<super::morphology::Offset>(),
     Entry::of::<super::morphology::Dilate>(),
     Entry::of::<super::morphology::Erode>(),
@@ -231,15 +275,15 @@ fn kind_of(property: &Value) -> String {
 ///
 /// A failed deserialisation of the whole struct does not say which field it was where structs are flattened, so each
 /// value is then tried alone over the defaults.
-fn parse<O: Operator>(values: Map<String, Value>) -> Result<O> {
-    let schema = schema_for!(O);
+pub(crate) fn parse<P: DeserializeOwned + JsonSchema>(operation: &str, values: Map<String, Value>) -> Result<P> {
+    let schema = schema_for!(P);
     let known = schema.get("properties").and_then(Value::as_object);
     if let Some(known) = known
         && let Some(name) = values.keys().find(|k| !known.contains_key(*k))
     {
         let accepted = suggest(name, known.keys().map(String::as_str));
         return Err(EditError::parameter(
-            O::NAME,
+            operation,
             name,
             values[name].to_string(),
             format!("no such parameter; {accepted}"),
@@ -249,11 +293,11 @@ fn parse<O: Operator>(values: Map<String, Value>) -> Result<O> {
     whole.map_err(|error| {
         for (name, value) in values {
             let alone = Map::from_iter([(name.clone(), value.clone())]);
-            if let Err(error) = serde_json::from_value::<O>(Value::Object(alone)) {
+            if let Err(error) = serde_json::from_value::<P>(Value::Object(alone)) {
                 let kind = known.and_then(|k| k.get(&name)).map(kind_of).unwrap_or_default();
-                return EditError::parameter(O::NAME, &name, value, format!("{error}; expected {kind}"));
+                return EditError::parameter(operation, &name, value, format!("{error}; expected {kind}"));
             }
         }
-        EditError::parameter(O::NAME, "parameters", "", error.to_string())
+        EditError::parameter(operation, "parameters", "", error.to_string())
     })
 }

@@ -1,7 +1,9 @@
 //! Analytic solids as level sets; every one a true distance.
 //!
 //! Spheres, boxes, tori, cylinders and capsules are sampled from their closed-form distance. A superellipsoid or supertoroid
-//! is sampled as an implicit function and its distance rebuilt from the zero set (Barr 1981).
+//! is sampled as an implicit function and its distance rebuilt from the zero set (Barr 1981). So are expressions: unions,
+//! intersections and differences, sharp or with rounded edges ([`expression`](crate::levelset::expression)), whose minima and maxima are
+//! distances on one side only. The polygons of the zero set cut up to half a voxel off a sharp edge.
 
 use std::path::Path;
 
@@ -13,7 +15,7 @@ use super::params::{WorldLength, voxel_size};
 use super::registry::{Arity, Operator, Outcome, Summary};
 use crate::error::{EditError, Result};
 use crate::grid::{MAX_COORD, Transform};
-use crate::levelset::shapes::Solid;
+use crate::levelset::expression::Expression;
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
 use crate::mesh::{BezierPatches, MeshToLevelSet, Rebuild, mesh_to_level_set, rebuild, shell};
 use crate::run::RunOptions;
@@ -24,7 +26,8 @@ use crate::spec::Spec;
 #[serde(default)]
 pub struct Shape {
     /// The solid, such as `torus major=1 minor=0.3 axis=z` (world units). Kinds: `sphere`, `box`, `torus`, `cylinder`, `capsule`,
-    /// `superellipsoid`, `supertoroid`, and `bezier file=F [thickness=t]` for the patches of a BPT file.
+    /// `superellipsoid`, `supertoroid`, and `bezier file=F [thickness=t]` for the patches of a BPT file, or the Bézier and NURBS surfaces of an OBJ file. Solids combine:
+    /// `union(A, B, …)`, `intersection(A, B, …)`, `difference(A, B, …)`, and `smooth-union(radius=r, A, B, …)` and its like with rounded edges.
     pub spec: String,
     /// Edge of a voxel in world units.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -47,31 +50,39 @@ const DEFAULT_RESOLUTION: u32 = 256;
 
 /// What is made: a solid with a formula, or the surface of a file of patches.
 enum Source {
-    Solid(Solid),
+    Solid(Expression),
     Patches { patches: BezierPatches, thickness: Option<f64> },
 }
 
 impl Source {
     fn parse(text: &str) -> Result<Self> {
-        let spec = Spec::parse("shape", text)?;
-        if spec.kind() != "bezier" {
-            return Solid::parse(text).map(Self::Solid);
+        if text.split_whitespace().next() != Some("bezier") {
+            return Expression::parse(text).map(Self::Solid);
         }
-        let file = spec.text("file").ok_or_else(|| spec.refuse("`bezier` needs `file=` (a BPT file of patches)"))?;
+        let spec = Spec::parse("shape", text)?;
+        let file = spec.text("file").ok_or_else(|| {
+            spec.refuse("`bezier` needs `file=` (a BPT file of patches, or an OBJ file of free-form surfaces)")
+        })?;
         let thickness = spec.number("thickness")?;
         spec.finish()?;
         if thickness.is_some_and(|t| t <= 0.0) {
             return Err(spec.refuse("`thickness` positive, or none for the inside of a closed surface"));
         }
-        Ok(Self::Patches { patches: BezierPatches::read(Path::new(file))?, thickness })
+        let file = Path::new(file);
+        let is_obj = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("obj"));
+        let patches = if is_obj { BezierPatches::read_obj(file)? } else { BezierPatches::read(file)? };
+        Ok(Self::Patches { patches, thickness })
     }
 
-    fn bounds(&self) -> (DVec3, DVec3) {
+    fn bounds(&self) -> Result<(DVec3, DVec3)> {
         match self {
-            Self::Solid(solid) => solid.bounds(),
+            Self::Solid(solid) => solid.bounds().ok_or_else(|| {
+                let accepted = "parts that overlap: nothing is inside of all of them";
+                EditError::parameter(Shape::NAME, "spec", "intersection", accepted)
+            }),
             Self::Patches { patches, thickness } => {
                 let ((lo, hi), margin) = (patches.bounds(), thickness.unwrap_or(0.0) / 2.0);
-                (lo - margin, hi + margin)
+                Ok((lo - margin, hi + margin))
             }
         }
     }
@@ -82,7 +93,7 @@ impl Shape {
         if let Some(size) = self.voxel_size {
             return voxel_size(Self::NAME, size);
         }
-        let (lo, hi) = source.bounds();
+        let (lo, hi) = source.bounds()?;
         Ok((hi - lo).max_element() / f64::from(self.resolution.unwrap_or(DEFAULT_RESOLUTION)))
     }
 }
@@ -106,7 +117,7 @@ impl Operator for Shape {
         }
         let size = self.resolved_voxel_size(&source)?;
         MeshToLevelSet { half_width: self.half_width, ..MeshToLevelSet::new(size) }.validate()?;
-        let (lo, hi) = source.bounds();
+        let (lo, hi) = source.bounds()?;
         let farthest = lo.abs().max(hi.abs()).max_element() / size + f64::from(self.half_width) + 2.0;
         if farthest > f64::from(MAX_COORD) {
             return Err(EditError::parameter(
@@ -123,11 +134,11 @@ impl Operator for Shape {
         self.validate()?;
         let source = Source::parse(&self.spec)?;
         let size = self.resolved_voxel_size(&source)?;
+        let (lo, hi) = source.bounds()?;
         let solid = match source {
             Source::Solid(solid) => solid,
             Source::Patches { patches, thickness } => return self.of_patches(&patches, thickness, size, run),
         };
-        let (lo, hi) = solid.bounds();
         let margin = f64::from(self.half_width) + 2.0;
         let bounds = ((lo / size - margin).floor().as_ivec3(), (hi / size + margin).ceil().as_ivec3());
         let sample = |half_width: f32| {
@@ -157,8 +168,7 @@ impl Shape {
         size: f64,
         run: &RunOptions,
     ) -> Result<Outcome> {
-        // Edges of a voxel: the triangles lie within an eighth of κ·h² of the surface.
-        let mesh = patches.tessellate(size);
+        let mesh = patches.tessellate(PATCH_TOLERANCE * size, run)?;
         let params = MeshToLevelSet { half_width: self.half_width, ..MeshToLevelSet::new(size) };
         if let Some(thickness) = thickness {
             let level_set = shell(&mesh, thickness, &params, run)?;
@@ -176,6 +186,9 @@ impl Shape {
         Ok(Outcome { level_set, summary: Summary { warnings: findings.warnings(), ..Summary::default() } })
     }
 }
+
+/// Distance, in voxels, within which patches are made triangles: a fifth of what polygons of a level set may be off by at an edge.
+const PATCH_TOLERANCE: f64 = 0.1;
 
 /// Voxels of thickness from which on a sheet in any position has whole voxels inside everywhere: the diagonal of a cell (√3),
 /// and room for the slope of the field on either side.
@@ -238,7 +251,7 @@ mod tests {
             ("superellipsoid radii=0.5,0.5,0.5", "sphere radius=0.5"),
             ("supertoroid radii=0.25,0.25,0.25 alpha=2", "torus major=0.5 minor=0.25"),
         ] {
-            let (ours, truth) = (make(spec, 0.02), Solid::parse(exact).unwrap());
+            let (ours, truth) = (make(spec, 0.02), Expression::parse(exact).unwrap());
             for &id in ours.grid().leaves() {
                 for at in ours.grid().mask(id).iter() {
                     let p = ours.transform().voxel_to_world(ours.grid().origin(id) + crate::grid::offset_to_local(at));

@@ -107,6 +107,11 @@ impl RegionSpecs {
         RegionPlan::parse(&self.0).map(drop)
     }
 
+    /// Whether all of them are neighbourhoods of points and curves.
+    pub fn is_around_curves(&self) -> bool {
+        RegionPlan::parse(&self.0).is_ok_and(|plan| plan.is_some_and(|plan| plan.is_around_curves()))
+    }
+
     /// The region on a level set, or `None` for everywhere. Reads the files that are named.
     pub fn on(&self, level_set: &LevelSet, run: &RunOptions) -> Result<Option<Box<dyn Region>>> {
         RegionPlan::parse(&self.0)?.map(|plan| plan.on(level_set, run)).transpose()
@@ -117,9 +122,12 @@ impl RegionSpecs {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvolutionOptions {
-    /// Steps of the largest stable size, 10 if neither this nor `time` is given; of a filter, how often it is applied, 1 if not given.
+    /// Steps of the largest stable size, 10 if neither this, `max_iterations` nor `time` is given and the flow does not stop by itself; of a filter, how often it is applied, 1 if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub iterations: Option<u32>,
+    /// Go on until nothing moves any more, for so many steps at most.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_iterations: Option<u32>,
     /// Flow time instead of a number of steps, in world units squared (a sphere of radius R shrinks as R² − 2·time).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub time: Option<f64>,
@@ -139,6 +147,9 @@ pub struct EvolutionOptions {
 /// Steps where nothing is asked for: enough to see, few enough to take back.
 const DEFAULT_ITERATIONS: u32 = 10;
 
+/// Most steps of a flow that stops by itself, where nothing is asked for: the approach to the limit is algebraic, not exponential.
+const MOST_ITERATIONS: u32 = 1000;
+
 /// Most renormalisations a step: more move the surface instead of repairing the distance.
 const MOST_NORMALIZATIONS: u32 = 100;
 
@@ -147,6 +158,10 @@ impl EvolutionOptions {
     pub fn validate(&self, operation: &str) -> Result<()> {
         if let (Some(_), Some(time)) = (self.iterations, self.time) {
             return Err(EditError::parameter(operation, "time", time, "either `iterations` or `time`, not both"));
+        }
+        if let (Some(most), true) = (self.max_iterations, self.iterations.is_some() || self.time.is_some()) {
+            let accepted = "without `iterations` and `time`, which say when to stop";
+            return Err(EditError::parameter(operation, "max_iterations", most, accepted));
         }
         if let Some(time) = self.time
             && !(time >= 0.0 && time.is_finite())
@@ -176,9 +191,20 @@ impl EvolutionOptions {
 
     /// When the flow ends.
     pub fn until(&self) -> Until {
-        match self.time {
-            Some(time) => Until::Time(time),
-            None => Until::Iterations(self.iterations.unwrap_or(DEFAULT_ITERATIONS)),
+        self.until_or(Until::Iterations(DEFAULT_ITERATIONS))
+    }
+
+    /// When a flow that stops by itself ends.
+    pub fn until_rest(&self) -> Until {
+        self.until_or(Until::Rest(MOST_ITERATIONS))
+    }
+
+    fn until_or(&self, unsaid: Until) -> Until {
+        match (self.time, self.iterations, self.max_iterations) {
+            (Some(time), ..) => Until::Time(time),
+            (_, Some(steps), _) => Until::Iterations(steps),
+            (.., Some(most)) => Until::Rest(most),
+            _ => unsaid,
         }
     }
 

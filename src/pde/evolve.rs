@@ -15,6 +15,8 @@ pub enum Until {
     Iterations(u32),
     /// After a time, in the unit that the speed function implies (world² for F = −H).
     Time(f64),
+    /// When a step moves next to nothing, and after so many steps at the latest: where a limit is approached, ever more slowly.
+    Rest(u32),
 }
 
 /// Why a flow ended.
@@ -26,7 +28,7 @@ pub enum StopReason {
     Time,
     /// The surface vanished, or the region touches nothing.
     NothingLeft,
-    /// The speed is 0 everywhere.
+    /// Nothing moves any more, or next to nothing where that was asked for.
     AtRest,
 }
 
@@ -58,7 +60,7 @@ pub(super) trait Motion {
 /// The time loop: steps and tracks until it is time to stop.
 pub(super) fn drive(tracker: &mut Tracker, motion: &mut impl Motion, until: Until) -> Result<Report> {
     let (most, end) = match until {
-        Until::Iterations(n) => (n, f64::INFINITY),
+        Until::Iterations(n) | Until::Rest(n) => (n, f64::INFINITY),
         Until::Time(t) if t >= 0.0 && t.is_finite() => (u32::MAX, t),
         Until::Time(t) => return Err(EditError::parameter("evolve", "time", t, "0 or more")),
     };
@@ -108,7 +110,8 @@ pub fn evolve(
 ) -> Result<Report> {
     let voxel_size = level_set.voxel_size();
     let mut tracker = Tracker::new(level_set, region, *solver, run);
-    drive(&mut tracker, &mut Flow { function, voxel_size }, until)
+    let rest = matches!(until, Until::Rest(_)).then_some(false);
+    drive(&mut tracker, &mut Flow { function, voxel_size, rest }, until)
 }
 
 /// Part of a step by which a time may exceed a whole number of steps without one more.
@@ -118,10 +121,15 @@ const WHOLE_STEPS: f64 = 1e-9;
 struct Flow<'a, F> {
     function: &'a F,
     voxel_size: f64,
+    /// Whether it has come to rest, if that is to be looked for.
+    rest: Option<bool>,
 }
 
 impl<F: SpeedFunction> Motion for Flow<'_, F> {
     fn prepare(&mut self, _: &Tracker, left: f64) -> Option<f64> {
+        if self.rest == Some(true) {
+            return None;
+        }
         let largest = self.function.largest_step(self.voxel_size);
         if left.is_infinite() {
             return Some(largest);
@@ -133,6 +141,10 @@ impl<F: SpeedFunction> Motion for Flow<'_, F> {
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
         let step = FlowStep { function: self.function, dt: dt as f32, voxel_size: self.voxel_size as f32 };
         // Flows of curvature are first order in time: dt is bounded by stability, not by accuracy.
-        tracker.integrate(&step, TimeIntegrator::TvdRk1, Target::Moving)
+        tracker.integrate(&step, TimeIntegrator::TvdRk1, Target::Moving)?;
+        if let Some(rest) = &mut self.rest {
+            *rest = tracker.last_change().is_rest(dt, self.voxel_size);
+        }
+        Ok(())
     }
 }

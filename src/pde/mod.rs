@@ -1,24 +1,39 @@
 //! Partial differential equations on the narrow band: the only time loop in the house.
 //!
-//! [`evolve`] moves a surface with a [`SpeedFunction`], [`morph_towards`] towards another one; [`filter()`] smooths the field; [`renormalize`] restores
+//! [`evolve`] moves a surface with a [`SpeedFunction`], such as a [`CurvatureFlow`], [`morph_towards`] towards another one; [`filter()`] smooths the field; [`renormalize`] restores
 //! |∇φ| = 1; [`track`] lets the band follow
 //! the surface: dilate, renormalise, trim. A [`Tracker`] does these steps one by one.
 
+mod advect;
+mod anisotropic;
+mod attract;
+mod curvature_flow;
 mod domain;
 mod evolve;
 mod filter;
+mod gate;
 mod morph;
 mod renormalize;
+mod rest;
+mod sharpen;
 mod speed;
 mod step;
+mod threshold;
 mod track;
 mod tracker;
 
+pub use advect::{VelocityField, advect};
+pub use anisotropic::{AnisotropicGaussian, filter_anisotropic};
+pub use attract::{Attraction, AttractionReport, Attractor, REACHED, attract};
+pub use curvature_flow::{CurvatureFlow, FlowCurvature};
 pub use evolve::{Report, StopReason, Until, evolve};
 pub use filter::{Filter, FilterKind, filter, offset};
+pub use gate::{CutOff, Direction};
 pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
+pub use sharpen::sharpen;
 pub use speed::SpeedFunction;
+pub use threshold::grow_by_threshold;
 pub use track::track;
 pub use tracker::Tracker;
 

@@ -209,13 +209,17 @@ fn difference_between_lattices(
     fastest
 }
 
-/// What both schemes share.
+/// φ − dt·F|∇φ| for a given F; what both schemes share.
 #[derive(Clone, Copy)]
-struct MorphStep<'a> {
-    speed: &'a Paged<LeafValues>,
-    form: MorphSpeed,
-    dt: f32,
-    voxel_size: f32,
+pub(super) struct MorphStep<'a> {
+    /// F of every voxel that moves.
+    pub speed: &'a Paged<LeafValues>,
+    /// The product.
+    pub form: MorphSpeed,
+    /// Time step.
+    pub dt: f32,
+    /// Edge of a voxel.
+    pub voxel_size: f32,
 }
 
 impl MorphStep<'_> {
@@ -244,7 +248,7 @@ impl MorphStep<'_> {
     }
 }
 
-struct FirstOrder<'a>(MorphStep<'a>);
+pub(super) struct FirstOrder<'a>(pub MorphStep<'a>);
 
 impl LeafKernel for FirstOrder<'_> {
     const REACH: usize = FaceHalo::REACH;

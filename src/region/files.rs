@@ -1,17 +1,17 @@
-//! What regions read from files: level sets, volumes, meshes and points.
+//! What regions and operators read from files beside their input: level sets, volumes, meshes and points.
 
 use std::path::Path;
 
 use glam::DVec3;
 
 use crate::error::{EditError, Result};
-use crate::grid::Volume;
+use crate::grid::{VectorVolume, Volume};
 use crate::levelset::LevelSet;
 use crate::mesh::{self, MeshFormat, MeshToLevelSet, mesh_to_level_set};
 use crate::run::RunOptions;
 
 /// The level set of a `.vdb` file, or of a mesh file at `voxel_size` with a band of `half_width` voxels.
-pub(super) fn level_set(
+pub(crate) fn level_set(
     path: &Path,
     grid: Option<&str>,
     voxel_size: f64,
@@ -30,12 +30,17 @@ pub(super) fn level_set(
 }
 
 /// The numbers of a grid of a `.vdb` file.
-pub(super) fn volume(path: &Path, grid: Option<&str>, run: &RunOptions) -> Result<Volume> {
+pub(crate) fn volume(path: &Path, grid: Option<&str>, run: &RunOptions) -> Result<Volume> {
     volumes::volume(path, grid, run)
 }
 
+/// The vectors of a grid of a `.vdb` file.
+pub(crate) fn vectors(path: &Path, grid: Option<&str>, run: &RunOptions) -> Result<VectorVolume> {
+    volumes::vectors(path, grid, run)
+}
+
 /// Points: the vertices of a mesh file, or a text of `x y z` or `x,y,z` a line (`#` begins a comment).
-pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
+pub(crate) fn points(path: &Path) -> Result<Vec<DVec3>> {
     if MeshFormat::of(path).is_some() {
         return Ok(mesh::read(path)?.mesh.positions);
     }
@@ -64,7 +69,7 @@ pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
 
 #[cfg(feature = "openvdb")]
 mod volumes {
-    use super::{EditError, LevelSet, Path, Result, RunOptions, Volume};
+    use super::{EditError, LevelSet, Path, Result, RunOptions, VectorVolume, Volume};
     use crate::vdb::{self, Band};
 
     pub fn level_set(path: &Path, grid: Option<&str>, run: &RunOptions) -> Result<LevelSet> {
@@ -82,11 +87,16 @@ mod volumes {
         let file = vdb::open(path, run)?;
         file.read_volume(file.select_scalar(grid)?, run)
     }
+
+    pub fn vectors(path: &Path, grid: Option<&str>, run: &RunOptions) -> Result<VectorVolume> {
+        let file = vdb::open(path, run)?;
+        file.read_vectors(file.select_vector(grid)?, run)
+    }
 }
 
 #[cfg(not(feature = "openvdb"))]
 mod volumes {
-    use super::{EditError, LevelSet, Path, Result, RunOptions, Volume};
+    use super::{EditError, LevelSet, Path, Result, RunOptions, VectorVolume, Volume};
 
     fn refuse<T>(path: &Path) -> Result<T> {
         Err(EditError::input(path, "this build has no OpenVDB and cannot read it; a mesh file works for `mesh file=`"))
@@ -97,6 +107,10 @@ mod volumes {
     }
 
     pub fn volume(path: &Path, _: Option<&str>, _: &RunOptions) -> Result<Volume> {
+        refuse(path)
+    }
+
+    pub fn vectors(path: &Path, _: Option<&str>, _: &RunOptions) -> Result<VectorVolume> {
         refuse(path)
     }
 }

@@ -4,18 +4,21 @@
 //! feathered by default, so that the result stays a distance at the region's rim.
 
 mod field;
-mod files;
+pub(crate) mod files;
 mod near;
 mod plan;
 mod primitive;
+mod voxels;
 mod weights;
 
 use glam::DVec3;
 
 pub use field::{Inside, Painted, Part};
+pub(crate) use files::volume as read_volume;
 pub use near::Near;
 pub use plan::RegionPlan;
 pub use primitive::{HalfSpace, Primitive, Shape};
+pub use voxels::VoxelSet;
 pub use weights::RegionWeights;
 
 /// A weight in space.

@@ -93,6 +93,14 @@ impl RegionPlan {
         Ok(if terms.is_empty() { None } else { Some(Self(terms)) })
     }
 
+    /// Whether all of them are neighbourhoods of points and curves.
+    pub fn is_around_curves(&self) -> bool {
+        let is_curve = |(join, term): &(Join, Term)| {
+            *join != Join::AndNot && matches!(term, Term::Points { .. } | Term::Curve { .. })
+        };
+        self.0.iter().all(is_curve)
+    }
+
     /// The region on `level_set`, whose voxels are the unit of depths and reaches. Reads the files that are named.
     pub fn on(&self, level_set: &LevelSet, run: &RunOptions) -> Result<Box<dyn Region>> {
         let mut whole: Option<Box<dyn Region>> = None;

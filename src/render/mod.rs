@@ -12,6 +12,7 @@ mod png;
 mod shade;
 mod skip;
 mod tile;
+mod vertices;
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -19,6 +20,7 @@ use serde::{Deserialize, Serialize};
 
 pub use camera::{CameraSpec, Frame, UpAxis};
 pub use png::Image;
+pub use vertices::{distance_colors, vertex_colors};
 
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
@@ -37,7 +39,7 @@ pub const MAX_SIZE: u32 = 16384;
 /// Name of the operation in errors and progress.
 const OPERATION: &str = "render";
 /// Curvature at which the diverging colours are saturated, where nothing else is asked: a radius of 8 voxels.
-const CURVATURE_RANGE: f64 = 0.125;
+pub const CURVATURE_RANGE: f64 = 0.125;
 /// Difference at which they are, in voxels.
 const DIFFERENCE_RANGE: f64 = 1.0;
 /// How far an obstacle darkens the sky, as a part of the surface's largest extent.

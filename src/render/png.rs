@@ -23,6 +23,18 @@ impl Image {
         self.rgba8.get(at..)?.first_chunk().copied()
     }
 
+    /// Pictures beside each other, as high as the lowest of them.
+    pub fn side_by_side(images: &[Self]) -> Self {
+        let height = images.iter().map(|image| image.height).min().unwrap_or(0);
+        let row = |image: &Self, y: u32| {
+            let length = image.width as usize * 4;
+            let start = y as usize * length;
+            image.rgba8.get(start..start + length).unwrap_or_default().to_vec()
+        };
+        let rgba8 = (0..height).flat_map(|y| images.iter().flat_map(move |image| row(image, y))).collect();
+        Self { width: images.iter().map(|image| image.width).sum(), height, rgba8 }
+    }
+
     /// Writes the picture as PNG, marked as sRGB; without an alpha channel where every pixel is opaque.
     pub fn write_png(&self, to: impl Write) -> io::Result<()> {
         let opaque = self.rgba8.chunks_exact(4).all(|p| p[3] == u8::MAX);
@@ -45,6 +57,16 @@ impl Image {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn rows_stay_together() {
+        let of = |value: u8, width: u32| Image { width, height: 2, rgba8: vec![value; width as usize * 8] };
+        let both = Image::side_by_side(&[of(1, 2), of(2, 1)]);
+        assert_eq!((both.width, both.height), (3, 2));
+        assert_eq!(both.pixel(1, 1), Some([1; 4]));
+        assert_eq!(both.pixel(2, 0), Some([2; 4]));
+        assert_eq!(both.rgba8.len(), 24);
+    }
 
     fn round_trip(image: &Image) -> (png::ColorType, bool, Vec<u8>) {
         let mut file = Vec::new();

@@ -4,6 +4,7 @@
 //! 8 voxels at once; it knows nothing of the tree, of regions or of time. All differences are unscaled (values are not
 //! divided by the voxel size) unless the name says otherwise.
 
+pub mod anisotropic;
 mod cube;
 pub mod curvature;
 pub mod eikonal;

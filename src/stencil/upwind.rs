@@ -62,6 +62,48 @@ pub fn godunov_weno5<S: Simd>(
     sum * (voxel_size * voxel_size)
 }
 
+/// V·Dφ (unscaled) of rows (x, y) and (x, y + 1) by first-order differences, taken on each axis from where V comes.
+#[inline(always)]
+pub fn transport_first<S: Simd>(
+    simd: S,
+    halo: &impl LeafHalo,
+    x: usize,
+    y: usize,
+    velocity: [Lanes<S>; 3],
+) -> Lanes<S> {
+    let (centre, zero) = (halo.centre(simd, x, y), Lanes::splat(simd, 0.0));
+    let mut sum = zero;
+    for (axis, v) in velocity.into_iter().enumerate() {
+        let [before, after] = halo.beside(simd, x, y, axis);
+        sum += v.max(zero) * (centre - before) + v.min(zero) * (after - centre);
+    }
+    sum
+}
+
+/// V·Dφ (unscaled) of rows (x, y) and (x, y + 1) by HJ-WENO5 differences, taken on each axis from where V comes.
+#[inline(always)]
+pub fn transport_weno5<S: Simd>(
+    simd: S,
+    halo: &StarHalo,
+    x: usize,
+    y: usize,
+    velocity: [Lanes<S>; 3],
+    voxel_size: f32,
+    epsilon: WenoEpsilon,
+) -> Lanes<S> {
+    let (centre, zero) = (halo.centre(simd, x, y), Lanes::splat(simd, 0.0));
+    let (weno, unit) = (Weno5::new(epsilon, voxel_size), 1.0 / voxel_size);
+    let mut sum = zero;
+    for (axis, v) in velocity.into_iter().enumerate() {
+        let [m3, m2, m1, p1, p2, p3] = halo.along(simd, x, y, axis);
+        let (v1, v2, v3) = ((m2 - m3) * unit, (m1 - m2) * unit, (centre - m1) * unit);
+        let (v4, v5, v6) = ((p1 - centre) * unit, (p2 - p1) * unit, (p3 - p2) * unit);
+        let (behind, ahead) = (Side::new([v1, v2, v3, v4, v5]), Side::new([v6, v5, v4, v3, v2]));
+        sum += v * weno.difference(simd, &behind.select(v.simd_gt(zero), &ahead));
+    }
+    sum * voxel_size
+}
+
 /// One axis of Godunov's |Dφ|² by HJ-WENO5 differences, from the values at −3, −2, −1, 1, 2, 3.
 #[inline(always)]
 fn godunov_weno5_axis<S: Simd>(

@@ -90,6 +90,7 @@ pub(super) mod ffi {
         fn tiles(self: &Leaves) -> Result<Vec<Tile>>;
         fn inactive_tile_range(self: &Leaves, low: &mut f64, high: &mut f64) -> Result<()>;
         fn archive_leaves(archive: &Archive, index: usize) -> Result<UniquePtr<Leaves>>;
+        fn archive_component(archive: &Archive, index: usize, component: u32) -> Result<UniquePtr<Leaves>>;
 
         type FloatGrid;
         fn add_leaves(self: Pin<&mut FloatGrid>, origins: &[i32]) -> Result<()>;

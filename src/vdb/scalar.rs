@@ -1,6 +1,6 @@
 //! The surface of a scalar volume (density, temperature) at a value.
 //!
-//! What is read is the field iso − value: negative where the volume holds more than iso, zero on the surface, linear between voxels as the
+//! What is read is the field iso − value (or value − iso): negative where the volume holds more than iso (less), zero on the surface, linear between voxels as the
 //! volume is. It is no distance; [`rebuild`](crate::mesh::rebuild) makes one of it.
 
 use glam::IVec3;
@@ -11,6 +11,7 @@ use crate::error::{EditError, Result};
 use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafValues, MAX_COORD, Volume};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
+use crate::scan::Inside;
 
 /// Bytes of a leaf: values, mask and tables, and once more the copy that is read into.
 const BYTES_A_LEAF: u64 = 2 * 2048 + 512;
@@ -40,21 +41,22 @@ impl VdbFile {
     }
 
     /// The field iso − value of a scalar grid, whose zero set is the volume's surface at `iso`, with leaves wherever that runs.
-    pub fn read_iso_field(&self, index: usize, iso: f32, run: &RunOptions) -> Result<LevelSet> {
+    pub fn read_iso_field(&self, index: usize, iso: f32, inside: Inside, run: &RunOptions) -> Result<LevelSet> {
         let listing = &self.listing().grids[index];
         let refuse = |problem: String| EditError::input(&self.path, format!("grid `{}`: {problem}", listing.selector));
         let failed = |e: cxx::Exception| refuse(e.what().into());
         let transform = listing.uniform_transform().map_err(refuse)?;
         let leaves = ffi::archive_leaves(&self.archive, index).map_err(failed)?;
-        let background = iso - leaves.background() as f32;
+        let background = inside.field(leaves.background() as f32, iso);
         if !(background > 0.0 && background.is_finite()) {
             return Err(refuse(format!(
-                "no closed surface at {iso}: everywhere outside of the volume its value is {}; take a larger value",
-                leaves.background()
+                "no closed surface at {iso}: everywhere outside of the volume its value is {}; take a {} value",
+                leaves.background(),
+                if inside == Inside::Above { "larger" } else { "smaller" }
             )));
         }
         let tiles = leaves.tiles().map_err(failed)?;
-        let solid: Vec<&ffi::Tile> = tiles.iter().filter(|tile| tile.value > iso).collect();
+        let solid: Vec<&ffi::Tile> = tiles.iter().filter(|tile| inside.field(tile.value, iso) < 0.0).collect();
         let blocks = leaves.count() as u64 + solid.iter().map(|tile| shell_size(tile)).sum::<u64>();
         run.reserve("reading a volume", blocks * BYTES_A_LEAF, "take a smaller volume")?;
 
@@ -64,7 +66,7 @@ impl VdbFile {
         let mut places: Vec<(IVec3, Source)> =
             stored.zip(0..).map(|(origin, leaf)| (origin, Source::Leaf(leaf))).collect();
         for tile in &solid {
-            shell(tile, |origin| places.push((origin, Source::Constant(iso - tile.value))));
+            shell(tile, |origin| places.push((origin, Source::Constant(inside.field(tile.value, iso)))));
         }
         let farthest = solid.iter().map(|tile| corner(tile).abs().max_element().saturating_add(tile.size as i32));
         let farthest = farthest.chain(places.iter().map(|(o, _)| o.abs().max_element())).max().unwrap_or(0);
@@ -79,7 +81,7 @@ impl VdbFile {
         for tile in solid.iter().filter(|tile| tile.size > LEAF_DIM as u32) {
             grid.set_sign(corner(tile), corner(tile) + tile.size as i32, true);
         }
-        fill(&mut grid, &places, &leaves, iso).map_err(refuse)?;
+        fill(&mut grid, &places, &leaves, iso, inside).map_err(refuse)?;
         surround(&mut grid);
         Ok(LevelSet::new(grid, transform))
     }
@@ -90,9 +92,16 @@ impl VdbFile {
     pub fn read_volume(&self, index: usize, run: &RunOptions) -> Result<Volume> {
         let listing = &self.listing().grids[index];
         let refuse = |problem: String| EditError::input(&self.path, format!("grid `{}`: {problem}", listing.selector));
+        let leaves = ffi::archive_leaves(&self.archive, index).map_err(|e| refuse(e.what().into()))?;
+        self.volume_of(index, &leaves, run)
+    }
+
+    /// The numbers of `leaves`, which are those of grid `index` or a component of them.
+    pub(super) fn volume_of(&self, index: usize, leaves: &ffi::Leaves, run: &RunOptions) -> Result<Volume> {
+        let listing = &self.listing().grids[index];
+        let refuse = |problem: String| EditError::input(&self.path, format!("grid `{}`: {problem}", listing.selector));
         let failed = |e: cxx::Exception| refuse(e.what().into());
         let transform = listing.uniform_transform().map_err(refuse)?;
-        let leaves = ffi::archive_leaves(&self.archive, index).map_err(failed)?;
         let bytes = leaves.count() as u64 * size_of::<LeafValues>() as u64;
         run.reserve("reading a volume", bytes, "take a smaller volume")?;
         let mut flat = vec![0; leaves.count() * 3];
@@ -147,7 +156,13 @@ fn shell(tile: &ffi::Tile, mut f: impl FnMut(IVec3)) {
 }
 
 /// Sets the values of all leaves. NaN counts as outside.
-fn fill(grid: &mut Grid, places: &[(IVec3, Source)], leaves: &ffi::Leaves, iso: f32) -> Result<(), String> {
+fn fill(
+    grid: &mut Grid,
+    places: &[(IVec3, Source)],
+    leaves: &ffi::Leaves,
+    iso: f32,
+    inside: Inside,
+) -> Result<(), String> {
     let background = grid.background();
     // A fresh grid has its leaves in slot order.
     let first = grid.leaves().first().map_or(0, |id| id.index());
@@ -161,7 +176,7 @@ fn fill(grid: &mut Grid, places: &[(IVec3, Source)], leaves: &ffi::Leaves, iso: 
                     failed.lock().unwrap_or_else(|p| p.into_inner()).get_or_insert(e.what().to_string());
                 }
                 for value in &mut values.0 {
-                    *value = if value.is_nan() { background } else { iso - *value };
+                    *value = if value.is_nan() { background } else { inside.field(*value, iso) };
                 }
             }
         }

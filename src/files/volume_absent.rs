@@ -10,6 +10,7 @@ use super::output::VolumeOptions;
 use crate::error::{EditError, Result};
 use crate::levelset::{Field, LevelSet};
 use crate::run::RunOptions;
+use crate::scan::Inside;
 
 const ABSENT: &str = "this vdb-edit was built without OpenVDB; build it with the feature `openvdb`";
 
@@ -64,7 +65,7 @@ impl Volume {
         match self.0 {}
     }
 
-    pub fn read_iso_field(&self, _: Option<&str>, _: f32, _: &RunOptions) -> Result<LevelSet> {
+    pub fn read_iso_field(&self, _: Option<&str>, _: f32, _: Inside, _: &RunOptions) -> Result<LevelSet> {
         match self.0 {}
     }
 

@@ -2,17 +2,16 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::ArgMatches;
 use serde_json::{Map, Value};
 
-use super::context::Context;
-use super::mesh_output::MeshOptions;
+use super::input;
+use super::mesh_output::{MeshOptions, MeshParams};
 use super::volume::{self, Volume};
-use super::{args, input};
 use crate::atomic;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{MeshFormat, TriangleMesh};
+use crate::run::RunOptions;
 
 /// A file to be written.
 pub struct Output {
@@ -25,7 +24,7 @@ pub struct Output {
 
 /// What it will hold.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Kind {
+pub enum Kind {
     Volume,
     Mesh,
 }
@@ -54,23 +53,18 @@ pub struct Written {
 }
 
 impl Output {
-    /// The output of a command, refused now if it could not be written later.
-    pub fn plan(matches: &ArgMatches, context: &Context) -> Result<Self> {
-        let path = matches.get_one::<PathBuf>("output").cloned().unwrap_or_default();
-        let kind = kind_of(&path)?;
-        if input::is_pipe(&path) && context.reporter.wants_json() {
-            let accepted = "a file: standard output takes either the .vdb or the --json result";
-            return Err(EditError::parameter("vdb-edit", "output", "-", accepted));
-        }
-        writable(&path)?;
-        let word = |id: &str| matches.get_one::<String>(id).cloned();
-        let options = VolumeOptions {
-            half: word("precision").map(|word| word == "half"),
-            compression: word("compression"),
-            only_result: args::flag(matches, "only-result"),
-        };
-        let mesh = MeshOptions::new(matches, &path)?;
+    /// An output that is refused now if it could not be written later.
+    pub fn plan(path: PathBuf, options: VolumeOptions, mesh: &MeshParams) -> Result<Self> {
+        let kind = Self::check(&path)?;
+        let mesh = MeshOptions::new(mesh, &path)?;
         Ok(Self { path, kind, options, mesh })
+    }
+
+    /// What a file at `path` would hold; refused if none can be written there.
+    pub fn check(path: &Path) -> Result<Kind> {
+        let kind = kind_of(path)?;
+        writable(path)?;
+        Ok(kind)
     }
 
     /// How meshes are written.
@@ -95,22 +89,22 @@ impl Output {
         level_set: &LevelSet,
         iso: f32,
         from: Option<(&Volume, Option<usize>)>,
-        context: &Context,
+        run: &RunOptions,
     ) -> Result<Written> {
-        context.run.check("writing")?;
+        run.check("writing")?;
         match self.kind {
             Kind::Volume => {
                 let (bytes, warnings) = volume::write(&self.path, level_set, from, &self.options)?;
                 Ok(Written { bytes: Some(bytes), warnings, ..Written::default() })
             }
-            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, iso, context),
+            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, iso, run),
         }
     }
 
     /// Writes a mesh that came from a file.
-    pub fn write_mesh(&self, mesh: TriangleMesh, context: &Context) -> Result<Written> {
-        context.run.check("writing")?;
-        self.mesh.write_mesh(&self.path, mesh, context)
+    pub fn write_mesh(&self, mesh: TriangleMesh, run: &RunOptions) -> Result<Written> {
+        run.check("writing")?;
+        self.mesh.write_mesh(&self.path, mesh, run)
     }
 }
 
@@ -123,6 +117,17 @@ fn kind_of(path: &Path) -> Result<Kind> {
         let accepted = format!("a file name that ends in {}, or `-`", input::EXTENSIONS);
         Err(EditError::parameter("vdb-edit", "output", path.display(), accepted))
     }
+}
+
+/// Refuses a result that is no valid level set.
+pub fn verify(operation: &str, level_set: &LevelSet) -> Result<()> {
+    let violations = level_set.check();
+    if violations.is_empty() {
+        return Ok(());
+    }
+    let said: Vec<String> = violations.iter().map(ToString::to_string).collect();
+    let problem = format!("--check: the result is not written: {}", said.join("; "));
+    Err(EditError::Unmet { operation: operation.into(), problem })
 }
 
 /// Refuses a path at which nothing can be written, by making a temporary file beside it.

@@ -9,6 +9,7 @@ use super::output::VolumeOptions;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
+use crate::scan::Inside;
 pub use crate::vdb::FieldToWrite;
 use crate::vdb::{
     Band, Compression, GridListing, GridToWrite, MetaItem, Precision, ReadLevelSet, VdbFile, WriteOptions,
@@ -89,8 +90,8 @@ impl Volume {
     }
 
     /// The field whose zero set is the surface of a scalar volume at a value; its level set is still to be made.
-    pub fn read_iso_field(&self, grid: Option<&str>, iso: f32, run: &RunOptions) -> Result<LevelSet> {
-        self.file.read_iso_field(self.file.select_scalar(grid)?, iso, run)
+    pub fn read_iso_field(&self, grid: Option<&str>, iso: f32, inside: Inside, run: &RunOptions) -> Result<LevelSet> {
+        self.file.read_iso_field(self.file.select_scalar(grid)?, iso, inside, run)
     }
 
     /// Whether the chosen grid is a level set, or the only grid that could be one.

@@ -2,20 +2,22 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::ArgMatches;
 use glam::DVec3;
-use serde_json::Value;
 
-use super::context::Context;
+use super::mesh_output;
 use super::volume::{self, BandState, Choice, Volume, VolumeGrid};
-use super::{args, mesh_output, table};
 use crate::error::{EditError, Result};
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, Violation, ViolationKind};
 use crate::mesh::{self, MeshFormat, MeshToLevelSet, Rebuild, TriangleMesh, mesh_to_level_set, rebuild};
 use crate::ops::{VoxelLength, WorldLength};
+use crate::run::RunOptions;
+use crate::scan::{Inside, Scan, is_scan};
 
 /// What can be read and written.
 pub const EXTENSIONS: &str = ".vdb, .obj, .ply, .stl, .glb, .gltf or .off";
+
+/// What to do with a scan where a level set is expected.
+const SCAN: &str = "is a scan: `vdb-edit convert --iso VALUE` makes a level set of it, `vdb-edit segment` a smooth one";
 
 /// Voxels along the longest axis where no size is given.
 const DEFAULT_RESOLUTION: f64 = 256.0;
@@ -39,14 +41,22 @@ pub fn is_volume(path: &Path) -> bool {
 }
 
 /// How inputs are read.
+#[derive(Clone, Debug, Default)]
 pub struct InputOptions {
-    grids: Vec<String>,
-    assume_level_set: bool,
-    repair: bool,
-    strict: bool,
-    voxel_size: Option<f64>,
-    resolution: Option<f64>,
-    half_width: Option<VoxelLength>,
+    /// Which level set of each `.vdb`; the last name goes for all that follow.
+    pub grids: Vec<String>,
+    /// Whether float grids without a class are taken for level sets.
+    pub assume_level_set: bool,
+    /// Whether invalid level sets are rebuilt from their surface.
+    pub repair: bool,
+    /// Whether meshes that would have to be repaired are refused.
+    pub strict: bool,
+    /// Edge of a voxel, for meshes.
+    pub voxel_size: Option<WorldLength>,
+    /// Voxels along the longest axis of all meshes together.
+    pub resolution: Option<f64>,
+    /// Half width of the band, for meshes.
+    pub half_width: Option<VoxelLength>,
 }
 
 /// A level set from a file.
@@ -69,43 +79,24 @@ impl Input {
 }
 
 impl InputOptions {
-    /// From the options of a command, whether they are its own or its operator's.
-    pub fn new(matches: &ArgMatches) -> Result<Self> {
-        let value = |id: &str| matches.try_get_one::<Value>(id).ok().flatten().cloned();
-        let refuse = |field: &str, value: &Value, accepted: &str| {
-            Err(EditError::parameter("convert", field, value.to_string().trim_matches('"'), accepted))
-        };
-        let voxel_size = match value("voxel_size") {
-            None => None,
-            Some(given) => match length_in_world(&given) {
-                Some(size) if size > 0.0 => Some(size),
-                _ => return refuse("voxel_size", &given, "a positive length in world units, such as 0.01"),
-            },
-        };
-        let resolution = match value("resolution") {
-            None => None,
-            Some(given) => match given.as_f64() {
-                Some(n) if n >= 1.0 => Some(n),
-                _ => return refuse("resolution", &given, "a number of voxels, 1 or more, such as 256"),
-            },
-        };
-        let half_width = match value("half_width") {
-            None => None,
-            Some(given) => match serde_json::from_value(given.clone()) {
-                Ok(width) => Some(width),
-                Err(_) => return refuse("half_width", &given, "a number of voxels, such as 3"),
-            },
-        };
-        let grids = matches.try_get_many::<String>("grid").ok().flatten();
-        Ok(Self {
-            grids: grids.map(|names| names.cloned().collect()).unwrap_or_default(),
-            assume_level_set: args::flag(matches, "assume-level-set"),
-            repair: args::flag(matches, "repair"),
-            strict: args::flag(matches, "strict"),
-            voxel_size,
-            resolution,
-            half_width,
-        })
+    /// Refuses what cannot work.
+    pub fn validate(&self) -> Result<()> {
+        let refuse =
+            |field: &str, value: String, accepted: &str| Err(EditError::parameter("convert", field, value, accepted));
+        if let Some(size) = self.voxel_size {
+            // Asked in a world whose voxels have no size, a length in voxels is no number.
+            let world = size.world(f64::NAN);
+            if !(world > 0.0 && world.is_finite()) {
+                return refuse("voxel_size", size.to_string(), "a positive length in world units, such as 0.01");
+            }
+        }
+        match (self.resolution, self.voxel_size) {
+            (Some(n), _) if !(n >= 1.0 && n.is_finite()) => {
+                refuse("resolution", n.to_string(), "a number of voxels, 1 or more, such as 256")
+            }
+            (Some(n), Some(_)) => refuse("resolution", n.to_string(), "either `voxel_size` or `resolution`, not both"),
+            _ => Ok(()),
+        }
     }
 
     /// Whether a size for meshes was given.
@@ -118,14 +109,6 @@ impl InputOptions {
         let grid = self.grids.get(n).or(self.grids.last());
         Choice { grid: grid.map(String::as_str), assume_level_set: self.assume_level_set }
     }
-}
-
-/// World units of a length that cannot be in voxels, because it says how large a voxel is.
-fn length_in_world(value: &Value) -> Option<f64> {
-    if value.as_str().is_some_and(|text| text.ends_with("vx")) {
-        return None;
-    }
-    serde_json::from_value::<WorldLength>(value.clone()).ok().map(|length| length.world(1.0))
 }
 
 /// Finds out without reading whole files whether all inputs are there; returns one line each on what they are.
@@ -150,6 +133,7 @@ pub fn probe(paths: &[PathBuf], options: &InputOptions) -> Result<Vec<String>> {
 
 fn mesh_format(path: &Path) -> Result<MeshFormat> {
     MeshFormat::of(path).ok_or_else(|| match std::fs::metadata(path) {
+        Ok(_) if is_scan(path) => EditError::input(path, SCAN),
         Err(e) => EditError::input(path, format!("cannot be opened: {e}")),
         Ok(facts) if facts.is_dir() => EditError::input(path, "is a folder; a file is wanted"),
         Ok(_) => {
@@ -172,9 +156,9 @@ pub fn load(
     paths: &[PathBuf],
     options: &InputOptions,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<Vec<Input>> {
-    load_with(paths, options, Volume::take, warnings, context)
+    load_with(paths, options, Volume::take, warnings, run)
 }
 
 /// As [`load`], for results that go beside the grids that the level sets are read from: files stay whole.
@@ -182,9 +166,9 @@ pub fn load_whole(
     paths: &[PathBuf],
     options: &InputOptions,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<Vec<Input>> {
-    load_with(paths, options, |volume, choice| volume.read(choice), warnings, context)
+    load_with(paths, options, |volume, choice| volume.read(choice), warnings, run)
 }
 
 fn load_with(
@@ -192,7 +176,7 @@ fn load_with(
     options: &InputOptions,
     read: impl Fn(&mut Volume, Choice) -> Result<VolumeGrid>,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<Vec<Input>> {
     if paths.iter().filter(|path| is_pipe(path)).count() > 1 {
         let accepted = "standard input can be read once: give `-` once";
@@ -205,9 +189,9 @@ fn load_with(
     let mut raw = Vec::new();
     let mut volumes = 0;
     for path in paths {
-        context.run.check("reading")?;
+        run.check("reading")?;
         if is_volume(path) {
-            let mut volume = volume::open(path, &context.run)?;
+            let mut volume = volume::open(path, run)?;
             warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
             let grid = read(&mut volume, options.choice(volumes))?;
             volumes += 1;
@@ -223,10 +207,10 @@ fn load_with(
             Raw::Volume(read) => {
                 let (volume, grid) = *read;
                 let index = grid.index;
-                (valid(path, grid, options, warnings, context)?, Some((volume, Some(index))), None)
+                (valid(path, grid, options, warnings, run)?, Some((volume, Some(index))), None)
             }
             Raw::Mesh(mesh) => {
-                (convert(path, &mesh, &conversion, warnings, context)?, None, mesh_output::attributes_of(&mesh))
+                (convert(path, &mesh, &conversion, warnings, run)?, None, mesh_output::attributes_of(&mesh))
             }
         };
         if level_set.is_empty() {
@@ -242,23 +226,36 @@ pub fn load_iso(
     path: &Path,
     options: &InputOptions,
     iso: f32,
+    inside: Inside,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<Option<Input>> {
+    let half_width = |voxel_size| options.half_width.map_or(DEFAULT_HALF_WIDTH, |w| w.voxels(voxel_size) as f32);
+    let no_surface = || {
+        let side = if inside == Inside::Above { "more" } else { "less" };
+        EditError::input(path, format!("no voxel holds {side} than {iso}: there is no surface"))
+    };
+    if is_scan(path) {
+        let scan = Scan::read(path, run)?;
+        let (scan, resampled) = scan.on_cubes(run).map_err(|problem| EditError::input(path, problem))?;
+        warnings.extend(resampled.map(|said| format!("{}: {said}", path.display())));
+        let field = scan.iso_field(iso, inside, run).map_err(|error| naming(path, error))?.ok_or_else(no_surface)?;
+        let level_set = rebuild(&field, &Rebuild::band(half_width(field.voxel_size())), run)?;
+        return Ok(Some(Input { path: path.to_path_buf(), level_set, source: None, attributes: None }));
+    }
     if !is_volume(path) || is_pipe(path) {
         return Ok(None);
     }
     let choice = options.choice(0);
-    let volume = volume::open(path, &context.run)?;
+    let volume = volume::open(path, run)?;
     if volume.has_level_set(choice) {
         return Ok(None);
     }
     warnings.extend(volume.warnings().iter().map(|w| format!("{}: {w}", path.display())));
-    let field = volume.read_iso_field(choice.grid, iso, &context.run)?;
-    let half_width = options.half_width.map_or(DEFAULT_HALF_WIDTH, |w| w.voxels(field.voxel_size()) as f32);
-    let level_set = rebuild(&field, &Rebuild::band(half_width), &context.run)?;
+    let field = volume.read_iso_field(choice.grid, iso, inside, run)?;
+    let level_set = rebuild(&field, &Rebuild::band(half_width(field.voxel_size())), run)?;
     if level_set.is_empty() {
-        return Err(EditError::input(path, format!("no voxel holds more than {iso}: there is no surface")));
+        return Err(no_surface());
     }
     Ok(Some(Input { path: path.to_path_buf(), level_set, source: Some((volume, None)), attributes: None }))
 }
@@ -292,7 +289,7 @@ fn conversion_of(raw: &[Raw], options: &InputOptions) -> Result<MeshToLevelSet> 
     let longest = together.map_or(0.0, |(lo, hi)| (hi - lo).max_element());
     let by_resolution = |n: f64| longest / n;
     let voxel_size = match (options.voxel_size, options.resolution, volume) {
-        (Some(size), ..) => size,
+        (Some(size), ..) => size.world(1.0),
         (None, Some(n), _) => by_resolution(n),
         (None, None, Some(level_set)) => level_set.voxel_size(),
         (None, None, None) => by_resolution(DEFAULT_RESOLUTION),
@@ -312,19 +309,18 @@ fn convert(
     mesh: &TriangleMesh,
     conversion: &MeshToLevelSet,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<LevelSet> {
-    let (level_set, findings) =
-        mesh_to_level_set(mesh, conversion, &context.run).map_err(|error| naming(path, error))?;
+    let (level_set, findings) = mesh_to_level_set(mesh, conversion, run).map_err(|error| naming(path, error))?;
     warnings.extend(findings.warnings().into_iter().map(|w| format!("{}: {w}", path.display())));
     // Where the mesh was repaired, its own volume says nothing.
     if findings.is_sound() && findings.duplicates_dropped == 0 {
-        let (wanted, has) = (enclosed_volume(mesh), level_set.measure(&context.run)?.volume);
+        let (wanted, has) = (enclosed_volume(mesh), level_set.measure(run)?.volume);
         if (has - wanted).abs() > LOST * wanted.abs() {
             warnings.push(format!(
-                "{}: the level set has {} % of the mesh's volume: parts or walls thinner than a voxel are lost; take a voxel size smaller than {:e}",
+                "{}: the level set has {:.1} % of the mesh's volume: parts or walls thinner than a voxel are lost; take a voxel size smaller than {:e}",
                 path.display(),
-                table::number(100.0 * has / wanted.abs()),
+                100.0 * has / wanted.abs(),
                 conversion.voxel_size
             ));
         }
@@ -352,7 +348,7 @@ fn valid(
     grid: VolumeGrid,
     options: &InputOptions,
     warnings: &mut Vec<String>,
-    context: &Context,
+    run: &RunOptions,
 ) -> Result<LevelSet> {
     let name = format!("{} [{}]", path.display(), grid.selector);
     let refuse = |problem: String| EditError::NotALevelSet {
@@ -369,7 +365,7 @@ fn valid(
         BandState::Rebuild { what, gross } if gross && !options.repair => return Err(refuse(what)),
         BandState::Rebuild { what, .. } => {
             warnings.push(format!("{name}: {what}: rebuilt from its surface"));
-            (rebuilt(&grid.level_set, context)?, true)
+            (rebuilt(&grid.level_set, run)?, true)
         }
     };
     let violations = level_set.check();
@@ -377,21 +373,26 @@ fn valid(
     if !violations.is_empty() {
         if options.repair && !is_rebuilt {
             warnings.push(format!("{name}: {said}: rebuilt from its surface"));
-            return rebuilt(&level_set, context);
+            return rebuilt(&level_set, run);
         }
         if is_gross(&violations, level_set.grid().active_voxels()) {
             return Err(refuse(said));
         }
         warnings.push(format!("{name}: {said}"));
     }
-    if level_set.half_width() < NARROWEST && !level_set.is_empty() {
-        warnings.push(format!(
-            "{name}: its band of {} voxels is too narrow to be edited: rebuilt from its surface with {DEFAULT_HALF_WIDTH}",
-            table::number(f64::from(level_set.half_width()))
-        ));
-        return rebuilt(&level_set, context);
+    wide_enough(&name, level_set, warnings, run)
+}
+
+/// A level set in a band that is wide enough to be edited; `name` is what a warning calls it.
+pub fn wide_enough(name: &str, level_set: LevelSet, warnings: &mut Vec<String>, run: &RunOptions) -> Result<LevelSet> {
+    if level_set.half_width() >= NARROWEST || level_set.is_empty() {
+        return Ok(level_set);
     }
-    Ok(level_set)
+    warnings.push(format!(
+        "{name}: its band of {:.2} voxels is too narrow to be edited: rebuilt from its surface with {DEFAULT_HALF_WIDTH}",
+        level_set.half_width()
+    ));
+    rebuilt(&level_set, run)
 }
 
 /// Whether so much is wrong that the values cannot be taken for distances.
@@ -406,9 +407,9 @@ fn is_gross(violations: &[Violation], active_voxels: u64) -> bool {
 }
 
 /// Distances anew from the surface, in a band that is wide enough for every operator.
-fn rebuilt(level_set: &LevelSet, context: &Context) -> Result<LevelSet> {
+fn rebuilt(level_set: &LevelSet, run: &RunOptions) -> Result<LevelSet> {
     let half_width = level_set.half_width().max(DEFAULT_HALF_WIDTH);
-    rebuild(level_set, &Rebuild::band(half_width), &context.run)
+    rebuild(level_set, &Rebuild::band(half_width), run)
 }
 
 #[cfg(test)]
@@ -428,8 +429,10 @@ mod tests {
 
     #[test]
     fn voxel_sizes_are_not_in_voxels() {
-        assert_eq!(length_in_world(&"0.5wu".into()), Some(0.5));
-        assert_eq!(length_in_world(&0.25.into()), Some(0.25));
-        assert_eq!(length_in_world(&"3vx".into()), None);
+        let of = |size: &str| InputOptions { voxel_size: size.parse().ok(), ..InputOptions::default() }.validate();
+        assert!(of("0.5wu").is_ok() && of("0.25").is_ok());
+        for size in ["3vx", "0", "-1"] {
+            assert!(of(size).is_err(), "{size}");
+        }
     }
 }

@@ -2,18 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::ArgMatches;
 use serde_json::{Map, Value};
 
-use super::context::Context;
+use super::input;
 use super::output::Written;
-use super::{args, input};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{
     self, Attributes, Bound, MeshFormat, TriangleMesh, level_set_to_mesh, level_set_to_quads, simplify,
     transfer_attributes,
 };
+use crate::run::RunOptions;
 
 /// The options of a mesh.
 #[derive(Default)]
@@ -37,37 +36,80 @@ enum Faces {
     Quads,
 }
 
-impl MeshOptions {
-    /// From the options of a command that writes to `path`: refused if that is no mesh, or cannot hold what is asked.
-    pub fn new(matches: &ArgMatches, path: &Path) -> Result<Self> {
-        let number = |id: &str| matches.try_get_one::<f64>(id).ok().flatten().copied();
-        let faces = match (number("simplify"), number("adaptivity")) {
+/// What is asked of a mesh; at most one of the first three.
+#[derive(Clone, Debug, Default)]
+pub struct MeshParams {
+    /// Part of the triangles to keep.
+    pub simplify: Option<f64>,
+    /// Voxels that vertices left out may be away from the result.
+    pub adaptivity: Option<f64>,
+    /// Quads instead of triangles.
+    pub quads: bool,
+    /// The mesh whose colours and texture coordinates are taken over.
+    pub attributes_from: Option<PathBuf>,
+}
+
+impl MeshParams {
+    fn faces(&self) -> Faces {
+        match (self.simplify, self.adaptivity) {
             (Some(ratio), _) => Faces::Part(ratio),
             (None, Some(voxels)) => Faces::Within(voxels),
-            (None, None) if args::flag(matches, "quads") => Faces::Quads,
+            (None, None) if self.quads => Faces::Quads,
             (None, None) => Faces::All,
+        }
+    }
+
+    /// Refuses numbers that cannot work, and several ways of having fewer faces at once.
+    pub fn validate(&self) -> Result<()> {
+        let refuse = |field: &str, value: f64, accepted: &str| {
+            Err(EditError::parameter("write", field, value, accepted.to_owned()))
         };
-        let source = args::paths(matches, "attributes-from").pop();
+        match (self.simplify, self.adaptivity, self.quads) {
+            (Some(ratio), ..) if !(ratio > 0.0 && ratio <= 1.0) => refuse("simplify", ratio, "a part above 0, up to 1"),
+            (_, Some(voxels), _) if !(0.0..=1.0).contains(&voxels) => {
+                refuse("adaptivity", voxels, "a number of voxels from 0 to 1")
+            }
+            (Some(ratio), Some(_), _) | (Some(ratio), _, true) => {
+                refuse("simplify", ratio, "one of `simplify`, `adaptivity` and `quads`")
+            }
+            (_, Some(voxels), true) => refuse("adaptivity", voxels, "one of `simplify`, `adaptivity` and `quads`"),
+            _ => Ok(()),
+        }
+    }
+
+    /// Refuses what a file at `path` cannot hold.
+    pub fn fits(&self, path: &Path) -> Result<()> {
         let format = MeshFormat::of(path);
         let refuse = |field: &str, value: String, accepted: &str| {
             Err(EditError::parameter("vdb-edit", field, value, accepted.to_owned()))
         };
         let is_mesh = format.is_some() && !input::is_volume(path);
         let accepted = "an output that is a mesh (.obj, .ply, .stl, .glb, .gltf or .off)";
-        match faces {
+        match self.faces() {
             Faces::Part(ratio) if !is_mesh => return refuse("simplify", ratio.to_string(), accepted),
             Faces::Within(voxels) if !is_mesh => return refuse("adaptivity", voxels.to_string(), accepted),
             Faces::Quads if !is_mesh => return refuse("quads", "true".into(), accepted),
             _ => {}
         }
-        let mut warnings = Vec::new();
-        let attributes = match source {
-            None => None,
+        match &self.attributes_from {
             Some(source) if !is_mesh || format.is_some_and(|format| !format.has_attributes()) => {
                 let accepted =
                     "an output that can hold colours and texture coordinates (.obj, .ply, .glb, .gltf or .off)";
-                return refuse("attributes_from", source.display().to_string(), accepted);
+                refuse("attributes_from", source.display().to_string(), accepted)
             }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl MeshOptions {
+    /// For a mesh at `path`: refused if that is no mesh, or cannot hold what is asked.
+    pub fn new(params: &MeshParams, path: &Path) -> Result<Self> {
+        params.fits(path)?;
+        let faces = params.faces();
+        let mut warnings = Vec::new();
+        let attributes = match params.attributes_from.clone() {
+            None => None,
             Some(source) => {
                 let mesh = input::read_mesh(&source, &mut warnings)?;
                 if attributes_of(&mesh).is_none() {
@@ -102,17 +144,12 @@ impl MeshOptions {
     }
 
     /// Writes the surface φ = `iso`.
-    pub fn write_level_set(&self, path: &Path, level_set: &LevelSet, iso: f32, context: &Context) -> Result<Written> {
+    pub fn write_level_set(&self, path: &Path, level_set: &LevelSet, iso: f32, run: &RunOptions) -> Result<Written> {
         if self.faces != Faces::Quads {
-            return self.write_triangles(
-                path,
-                level_set_to_mesh(level_set, iso, &context.run)?,
-                level_set.voxel_size(),
-                context,
-            );
+            return self.write_triangles(path, level_set_to_mesh(level_set, iso, run)?, level_set.voxel_size(), run);
         }
-        let mut mesh = level_set_to_quads(level_set, iso, &context.run)?;
-        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, context)? {
+        let mut mesh = level_set_to_quads(level_set, iso, run)?;
+        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, run)? {
             (mesh.colors, mesh.uvs) = (colors, uvs);
         }
         mesh::write_quads(path, &mesh)?;
@@ -126,8 +163,8 @@ impl MeshOptions {
     }
 
     /// Writes a mesh that came from a file.
-    pub fn write_mesh(&self, path: &Path, mesh: TriangleMesh, context: &Context) -> Result<Written> {
-        self.write_triangles(path, mesh, 1.0, context)
+    pub fn write_mesh(&self, path: &Path, mesh: TriangleMesh, run: &RunOptions) -> Result<Written> {
+        self.write_triangles(path, mesh, 1.0, run)
     }
 
     fn write_triangles(
@@ -135,7 +172,7 @@ impl MeshOptions {
         path: &Path,
         mut mesh: TriangleMesh,
         voxel_size: f64,
-        context: &Context,
+        run: &RunOptions,
     ) -> Result<Written> {
         let mut warnings = self.warnings.clone();
         let mut details = Map::new();
@@ -145,13 +182,13 @@ impl MeshOptions {
             _ => None,
         };
         if let Some(bound) = bound {
-            let simplified = simplify(&mesh, bound, &context.run)?;
+            let simplified = simplify(&mesh, bound, run)?;
             details.insert("triangles_before".into(), mesh.triangles.len().into());
             details.insert("deviation".into(), simplified.deviation.into());
             warnings.extend(simplified.warnings);
             mesh = simplified.mesh;
         }
-        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, context)? {
+        if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, run)? {
             (mesh.colors, mesh.uvs) = (colors, uvs);
         }
         mesh::write(path, &mesh)?;
@@ -159,9 +196,9 @@ impl MeshOptions {
         Ok(Written { bytes: size(path), warnings, details })
     }
 
-    fn attributes(&self, positions: &[glam::DVec3], context: &Context) -> Result<Option<Attributes>> {
+    fn attributes(&self, positions: &[glam::DVec3], run: &RunOptions) -> Result<Option<Attributes>> {
         let Some((path, source)) = &self.attributes else { return Ok(None) };
-        let found = transfer_attributes(source, positions, &context.run);
+        let found = transfer_attributes(source, positions, run);
         found.map(Some).map_err(|error| input::naming(path, error))
     }
 }

@@ -1,0 +1,93 @@
+// Grids of vectors, component by component: what `Leaves` says of scalar grids. Only what velocities need: no nodes.
+
+#include "internal.h"
+
+#include <algorithm>
+
+namespace vdb_edit {
+
+namespace {
+
+/// One component of the leaves of a tree of Vec3f or Vec3d.
+template<typename GridT>
+class ComponentOf final : public Leaves::Impl {
+    using TreeT = typename GridT::TreeType;
+    using LeafT = typename TreeT::LeafNodeType;
+    using Upper = typename TreeT::RootNodeType::ChildNodeType;
+    using Lower = typename Upper::ChildNodeType;
+
+public:
+    ComponentOf(typename GridT::ConstPtr grid, int component) : grid_(std::move(grid)), component_(component)
+    {
+        const TreeT& tree = grid_->tree();
+        tree.getNodes(leaves_);
+        tree.getNodes(lower_);
+        tree.getNodes(upper_);
+    }
+
+    std::size_t count() const override { return leaves_.size(); }
+    double background() const override { return static_cast<double>(grid_->background()[component_]); }
+    void origins(rust::Slice<std::int32_t> out) const override { write_origins(leaves_, out); }
+
+    void copy(std::size_t first, rust::Slice<float> values, rust::Slice<std::uint64_t> masks) const override
+    {
+        const std::size_t n = values.size() / kLeafVoxels;
+        require(values.size() == n * kLeafVoxels && masks.size() == n * kMaskWords, "copy: wrong length");
+        require(first <= leaves_.size() && n <= leaves_.size() - first, "copy: leaves out of range");
+        for (std::size_t i = 0; i < n; ++i) {
+            const LeafT& leaf = *leaves_[first + i];
+            const auto* source = leaf.buffer().data();
+            std::transform(source, source + kLeafVoxels, values.data() + i * kLeafVoxels,
+                [this](const auto& v) { return static_cast<float>(v[component_]); });
+            for (std::size_t w = 0; w < kMaskWords; ++w) {
+                masks[i * kMaskWords + w] = leaf.getValueMask().template getWord<std::uint64_t>(openvdb::Index(w));
+            }
+        }
+    }
+
+    std::size_t node_count() const override { return 0; }
+    void node_origins(rust::Slice<std::int32_t>) const override {}
+    void node_inside(rust::Slice<std::uint64_t>) const override {}
+
+    void tiles(rust::Vec<Tile>& out) const override
+    {
+        const auto add = [&](const auto& it, std::uint32_t size) {
+            const openvdb::Coord at = it.getCoord();
+            const auto value = static_cast<float>(it.getValue()[component_]);
+            if (it.isValueOn()) out.push_back(Tile{at.x(), at.y(), at.z(), size, value, true});
+        };
+        for (const Lower* node : lower_) {
+            for (auto it = node->cbeginValueOn(); it; ++it) add(it, 8);
+        }
+        for (const Upper* node : upper_) {
+            for (auto it = node->cbeginValueOn(); it; ++it) add(it, 128);
+        }
+        for (auto it = grid_->tree().root().cbeginValueOn(); it; ++it) add(it, 4096);
+    }
+
+    void inactive_tile_range(double& low, double& high) const override { low = high = background(); }
+
+private:
+    typename GridT::ConstPtr grid_;
+    int component_;
+    std::vector<const LeafT*> leaves_;
+    std::vector<const Lower*> lower_;
+    std::vector<const Upper*> upper_;
+};
+
+} // namespace
+
+std::unique_ptr<Leaves> component_of(const openvdb::GridBase::ConstPtr& grid, std::uint32_t component)
+{
+    require(component < 3, "a vector has components 0 to 2");
+    const int c = static_cast<int>(component);
+    if (const auto floats = openvdb::gridConstPtrCast<openvdb::Vec3SGrid>(grid)) {
+        return std::make_unique<Leaves>(std::make_unique<ComponentOf<openvdb::Vec3SGrid>>(floats, c));
+    }
+    if (const auto doubles = openvdb::gridConstPtrCast<openvdb::Vec3DGrid>(grid)) {
+        return std::make_unique<Leaves>(std::make_unique<ComponentOf<openvdb::Vec3DGrid>>(doubles, c));
+    }
+    throw std::invalid_argument("a grid of type " + grid->type() + " holds no vectors of three numbers");
+}
+
+} // namespace vdb_edit

@@ -1,0 +1,283 @@
+//! The result of an operator that moves the whole surface, confined to a region.
+//!
+//! φ' = (1 − α) φ + α φ_new, on a band wide enough that both are distances wherever the two differ in sign. φ' is no distance
+//! where α varies; its zero set is the new surface, and the distance to that is rebuilt exactly around the region. Voxels that
+//! were active with α = 0 keep their bits, so where a steep surface rises beside them the field is cut to what they allow,
+//! |φ(x) − φ(f)| ≤ |x − f|: the surface stays out of the balls that they say are empty, as in an intersection of solids.
+//!
+//! The work is proportional to the region, and to the surface within the operator's reach of it.
+
+use std::collections::VecDeque;
+
+use glam::{DVec3, IVec3};
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use super::csg::{CsgOperation, csg};
+use crate::error::Result;
+use crate::grid::{Grid, LEAF_VOXELS, LeafId, LeafMask, LeafSet, leaf_offset, leaf_origin, offset_to_local};
+use crate::levelset::LevelSet;
+use crate::mesh::{Rebuild, rebuild, with_half_width};
+use crate::region::{Region, RegionWeights};
+use crate::run::RunOptions;
+
+/// How far an operator acts, in voxels.
+pub(super) struct Reach {
+    /// From the old surface to points that change sides.
+    pub moves: f64,
+    /// From a point to the old surface that decides whether it changes sides.
+    pub sees: f64,
+}
+
+/// Slope between a kept voxel and another above which the other is cut: 1, and what the polygons of a surface add.
+const STEEPEST: f32 = 1.02;
+
+/// What `operator` makes of the level set in `region`; `None` if the region touches nothing that it could change.
+pub(super) fn confined(
+    operation: &str,
+    level_set: &LevelSet,
+    region: &dyn Region,
+    reach: &Reach,
+    operator: impl FnOnce(LevelSet) -> Result<LevelSet>,
+    run: &RunOptions,
+) -> Result<Option<LevelSet>> {
+    let half_width = level_set.half_width();
+    let inner = IndexBox::around(region, level_set);
+    let margin = 2.0 * f64::from(half_width) + reach.moves + reach.sees + 4.0;
+    let source = match &inner {
+        Some(inner) => inner.padded(margin).crop(level_set, run)?,
+        None => level_set.clone(),
+    };
+    let mut blended = with_half_width(&source, half_width + reach.moves as f32 + 1.0, run)?;
+    let weights = RegionWeights::new(blended.grid(), blended.transform(), region);
+    if weights.leaves().is_empty() {
+        return Ok(None);
+    }
+    let moved = operator(blended.clone())?;
+    run.check(operation)?;
+    blend(&mut blended, &weights, moved.grid());
+    let touched: Vec<IVec3> = weights.leaves().iter().map(|id| blended.grid().origin(id)).collect();
+    let rebuilt = rebuild(&blended, &Rebuild::band(half_width), run)?;
+    drop((blended, moved, weights));
+    run.check(operation)?;
+    let around = inner.map(|inner| inner.padded(f64::from(half_width) + 1.0));
+    Ok(Some(Merge::new(level_set, rebuilt.grid(), region, around).result(&touched)))
+}
+
+/// φ ← (1 − α) φ + α φ_new where α > 0.
+fn blend(level_set: &mut LevelSet, weights: &RegionWeights, new: &Grid) {
+    let before = level_set.grid().clone();
+    level_set.grid_mut().update(weights.leaves(), |id, values, mask| {
+        let there = &new.values(new.find(before.origin(id))).0;
+        let (alpha, positive) = (&weights.alpha(id).0, weights.positive(id));
+        for at in mask.zip(positive, |active, positive| active & positive).iter() {
+            values.0[at] = (1.0 - alpha[at]) * values.0[at] + alpha[at] * there[at];
+        }
+    });
+}
+
+/// A box of voxels in index space.
+struct IndexBox {
+    lo: DVec3,
+    hi: DVec3,
+}
+
+impl IndexBox {
+    /// Around a region, if it has bounds.
+    fn around(region: &dyn Region, level_set: &LevelSet) -> Option<Self> {
+        let (lo, hi) = region.bounds()?;
+        let corners = (0..8).map(|c| {
+            let pick = |axis: usize| if c >> axis & 1 == 1 { hi[axis] } else { lo[axis] };
+            level_set.transform().world_to_index(DVec3::new(pick(0), pick(1), pick(2)))
+        });
+        let empty = Self { lo: DVec3::INFINITY, hi: DVec3::NEG_INFINITY };
+        Some(corners.fold(empty, |b, p| Self { lo: b.lo.min(p), hi: b.hi.max(p) }))
+    }
+
+    fn padded(&self, voxels: f64) -> Self {
+        Self { lo: self.lo - voxels, hi: self.hi + voxels }
+    }
+
+    fn holds(&self, ijk: IVec3) -> bool {
+        let p = ijk.as_dvec3();
+        p.cmpge(self.lo).all() && p.cmple(self.hi).all()
+    }
+
+    /// The part of a level set in the box, closed by its sides.
+    fn crop(&self, level_set: &LevelSet, run: &RunOptions) -> Result<LevelSet> {
+        let Some((lo, hi)) = level_set.grid().active_bounds() else { return Ok(level_set.clone()) };
+        let (lo, hi) = (lo.as_dvec3() - 8.0, hi.as_dvec3() + 8.0);
+        if self.lo.cmple(lo).all() && self.hi.cmpge(hi).all() {
+            return Ok(level_set.clone());
+        }
+        // Not beyond the surface, where its sides would cost and close nothing.
+        let (lo, hi) = (self.lo.max(lo), self.hi.min(hi));
+        if lo.cmpge(hi).any() {
+            return Ok(LevelSet::empty(*level_set.transform(), level_set.half_width()));
+        }
+        let (centre, half) = ((lo + hi) / 2.0, (hi - lo) / 2.0);
+        let distance = |p: DVec3| {
+            let d = (p - centre).abs() - half;
+            d.max(DVec3::ZERO).length() + d.max_element().min(0.0)
+        };
+        let half_width = level_set.half_width();
+        let rim = f64::from(half_width) + 2.0;
+        let bounds = ((lo - rim).floor().as_ivec3(), (hi + rim).ceil().as_ivec3());
+        let sides = LevelSet::from_distance(*level_set.transform(), half_width, bounds, distance, run)?;
+        csg(level_set, &[&sides], CsgOperation::Intersection, run)
+    }
+}
+
+/// The old grid with the rebuilt one around the region, but for the voxels that are kept.
+struct Merge<'a> {
+    old: &'a LevelSet,
+    new: &'a Grid,
+    weights: RegionWeights,
+    around: Option<IndexBox>,
+}
+
+impl<'a> Merge<'a> {
+    fn new(old: &'a LevelSet, new: &'a Grid, region: &dyn Region, around: Option<IndexBox>) -> Self {
+        Self { old, new, weights: RegionWeights::new(old.grid(), old.transform(), region), around }
+    }
+
+    /// Of a leaf of the old grid, the voxels that keep their bits: active with α = 0.
+    fn kept(&self, id: LeafId) -> LeafMask {
+        if id.is_sentinel() {
+            return LeafMask::EMPTY;
+        }
+        self.old.grid().mask(id).zip(self.weights.positive(id), |active, positive| active & !positive)
+    }
+
+    fn is_kept(&self, ijk: IVec3) -> bool {
+        self.kept(self.old.grid().find(leaf_origin(ijk))).get(leaf_offset(ijk))
+    }
+
+    fn is_around(&self, ijk: IVec3) -> bool {
+        self.around.as_ref().is_none_or(|around| around.holds(ijk))
+    }
+
+    /// `touched`: origins of the leaves where the sign may have changed.
+    fn result(&self, touched: &[IVec3]) -> LevelSet {
+        let (old, new) = (self.old.grid(), self.new);
+        let mut result = self.old.clone();
+        let reaches = |origin: &IVec3| self.is_around(*origin + 7) || self.is_around(*origin) || self.overlaps(*origin);
+        let mut missing: Vec<IVec3> = new.leaves().iter().map(|&id| new.origin(id)).filter(reaches).collect();
+        missing.extend(touched.iter().filter(|&&origin| new.find(origin) != old.find(origin)));
+        missing.retain(|&origin| old.find(origin).is_sentinel());
+        missing.sort_unstable_by_key(|o| (o.x, o.y, o.z));
+        missing.dedup();
+        let mut changed: LeafSet = result.grid_mut().add_leaves(&missing).into_iter().collect();
+        let of_old = |id: &LeafId| reaches(&old.origin(*id)) && self.differs(*id);
+        old.leaves().iter().copied().filter(of_old).for_each(|id| _ = changed.insert(id));
+
+        let before = result.grid().clone();
+        result.grid_mut().update(&changed, |id, values, mask| {
+            let origin = before.origin(id);
+            let there = new.find(origin);
+            let (from, active) = (new.values(there), new.mask(there));
+            let kept = self.kept(old.find(origin));
+            for at in 0..LEAF_VOXELS {
+                if !kept.get(at) && self.is_around(origin + offset_to_local(at)) {
+                    values.0[at] = from.0[at];
+                    mask.set(at, active.get(at));
+                }
+            }
+        });
+        drop(before);
+        self.cut_to_kept(&mut result, &mut changed);
+        result.grid_mut().prune(&changed);
+        result
+    }
+
+    fn overlaps(&self, origin: IVec3) -> bool {
+        self.around
+            .as_ref()
+            .is_none_or(|b| (origin + 7).as_dvec3().cmpge(b.lo).all() && origin.as_dvec3().cmple(b.hi).all())
+    }
+
+    /// Whether a leaf of the old grid has anything to take from the new one.
+    fn differs(&self, id: LeafId) -> bool {
+        if !self.weights.positive(id).is_empty() {
+            return true;
+        }
+        let (old, there) = (self.old.grid(), self.new.find(self.old.grid().origin(id)));
+        let appear = self.new.mask(there).zip(old.mask(id), |new, old| new & !old);
+        let (before, after) = (&old.values(id).0, &self.new.values(there).0);
+        !appear.is_empty()
+            || (0..LEAF_VOXELS).any(|at| !old.mask(id).get(at) && (before[at] < 0.0) != (after[at] < 0.0))
+    }
+
+    /// Cuts the field beside kept voxels to what they allow.
+    fn cut_to_kept(&self, result: &mut LevelSet, changed: &mut LeafSet) {
+        let (voxel_size, background) = (result.voxel_size() as f32, result.background());
+        for side in [1.0, -1.0] {
+            let cut = self.cuts(result.grid(), changed, side, voxel_size);
+            if cut.is_empty() {
+                continue;
+            }
+            let mut origins: Vec<IVec3> = cut.keys().map(|ijk| leaf_origin(*ijk)).collect();
+            origins.sort_unstable_by_key(|o| (o.x, o.y, o.z));
+            origins.dedup();
+            let missing: Vec<IVec3> =
+                origins.iter().copied().filter(|o| result.grid().find(*o).is_sentinel()).collect();
+            let added = result.grid_mut().add_leaves(&missing);
+            added.into_iter().for_each(|id| _ = changed.insert(id));
+            let set: LeafSet = origins.iter().map(|o| result.grid().find(*o)).collect();
+            set.iter().for_each(|id| _ = changed.insert(id));
+            let before = result.grid().clone();
+            result.grid_mut().update(&set, |id, values, mask| {
+                for at in 0..LEAF_VOXELS {
+                    if let Some(value) = cut.get(&(before.origin(id) + offset_to_local(at))) {
+                        values.0[at] = *value;
+                        mask.set(at, value.abs() < background);
+                    }
+                }
+            });
+        }
+    }
+
+    /// The voxels, none of them kept, where `side`·φ is above what kept ones allow, with their new values.
+    fn cuts(&self, grid: &Grid, changed: &LeafSet, side: f32, voxel_size: f32) -> FxHashMap<IVec3, f32> {
+        let steps: Vec<(IVec3, f32)> = (0..27)
+            .map(|n| IVec3::new(n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1))
+            .filter(|step| *step != IVec3::ZERO)
+            .map(|step| (step, step.as_vec3().length() * voxel_size * STEEPEST))
+            .collect();
+        // Kept voxels lie beside changed ones in the next leaf as well.
+        let around = |id: LeafId| grid.neighbours()[id.index()].into_iter().filter(|id| !id.is_sentinel());
+        let leaves: LeafSet = changed.iter().flat_map(around).collect();
+        let leaves: Vec<LeafId> = leaves.iter().collect();
+        let seeds: Vec<(IVec3, f32)> = leaves
+            .par_iter()
+            .flat_map_iter(|&id| {
+                let origin = grid.origin(id);
+                let kept = self.kept(self.old.grid().find(origin));
+                let mut accessor = grid.accessor();
+                let mut found = Vec::new();
+                for at in kept.iter() {
+                    let (ijk, value) = (origin + offset_to_local(at), grid.values(id).0[at]);
+                    if steps.iter().any(|(step, most)| side * (accessor.value(ijk + *step) - value) > *most) {
+                        found.push((ijk, value));
+                    }
+                }
+                found
+            })
+            .collect();
+        let mut cut: FxHashMap<IVec3, f32> = FxHashMap::default();
+        let mut queue: VecDeque<(IVec3, f32)> = seeds.into();
+        let mut accessor = grid.accessor();
+        // The least value over all paths from kept voxels, whatever the order.
+        while let Some((ijk, value)) = queue.pop_front() {
+            for (step, most) in &steps {
+                let (beside, limit) = (ijk + *step, value + side * most);
+                let now = cut.get(&beside).copied().unwrap_or_else(|| accessor.value(beside));
+                if side * (now - limit) > 0.0 && self.is_around(beside) && !self.is_kept(beside) {
+                    cut.insert(beside, limit);
+                    queue.push_back((beside, limit));
+                }
+            }
+        }
+        cut
+    }
+}
