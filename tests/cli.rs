@@ -671,3 +671,46 @@ fn info_writes_curvatures_beside_the_level_set() {
     desk.run(&["info", "s.vdb", "mean.vdb", "--write-curvature", "mean", "o.vdb"]).fails(2, &["one input"]);
     assert!(!desk.path("o.vdb").exists());
 }
+
+#[test]
+fn geodesic_distances_are_a_grid_or_vertex_colours() {
+    let desk = Desk::new();
+    desk.sphere("s.vdb");
+    let found = desk.done(&["geodesic", "s.vdb", "--from", "0,0,1", "-o", "g.vdb", "--json"]).json();
+    // The antipode is π away.
+    let farthest = found["farthest"].as_f64().unwrap();
+    assert!((farthest / std::f64::consts::PI - 1.0).abs() < 0.03 && found["unreachable_voxels"] == 0, "{found}");
+    let listing = vdb_edit::vdb::list(desk.path("g.vdb")).unwrap();
+    let grids: Vec<_> = listing.grids.iter().map(|g| (g.name.as_str(), g.class.as_str())).collect();
+    assert_eq!(grids, [("surface", "level set"), ("geodesic", "unknown")]);
+    // Several points, which may begin with a minus; the nearest counts.
+    let both = desk.done(&["geodesic", "s.vdb", "--from", "0,0,1", "-0.0,0,-1", "-o", "g.ply", "--json"]).json();
+    assert!((both["farthest"].as_f64().unwrap() / farthest - 0.5).abs() < 0.03, "{both}");
+    assert!(std::fs::read(desk.path("g.ply")).unwrap().windows(3).any(|w| w == b"red"));
+    desk.run(&["geodesic", "s.vdb", "--from", "0,0,9", "-o", "o.vdb"])
+        .fails(2, &["from", "closest point on it is 0,0,1"]);
+    desk.run(&["geodesic", "s.vdb", "--from", "0,0,1", "-o", "o.vdb", "--check"]).fails(2, &["check"]);
+    assert!(!desk.path("o.vdb").exists());
+}
+
+#[test]
+fn smooth_csg_and_anisotropic_smoothing_are_reached() {
+    let desk = Desk::new();
+    desk.sphere("a.vdb");
+    desk.done(&["transform", "a.vdb", "--translate", "1.2,0,0", "-o", "b.vdb"]);
+    let plain = desk.done(&["csg", "union", "a.vdb", "b.vdb", "-o", "u.vdb", "--json"]).json();
+    let smooth = ["csg", "smooth-union", "a.vdb", "b.vdb", "-o", "s.vdb", "--radius", "0.4", "--check", "--json"];
+    let smooth = desk.done(&smooth).json();
+    assert!(smooth["volume_after"].as_f64().unwrap() > plain["volume_after"].as_f64().unwrap() * 1.005);
+    desk.run(&["csg", "smooth-union", "a.vdb", "b.vdb", "-o", "o.vdb"]).fails(2, &["radius"]);
+    desk.run(&["csg", "smooth-union", "a.vdb", "b.vdb", "-o", "o.vdb", "--radius", "-1"]).fails(2, &["radius", "-1"]);
+    let method =
+        ["smooth", "u.vdb", "-o", "f.vdb", "--method", "anisotropic", "--sigma", "1,1.5", "--direction", "add"];
+    let filtered = desk.done(&[&method[..], &["--check", "--json"]].concat()).json();
+    assert!(filtered["volume_after"].as_f64().unwrap() > filtered["volume_before"].as_f64().unwrap());
+    assert_eq!(filtered["filtered_in_half_width"], 4.0);
+    desk.run(&["smooth", "u.vdb", "-o", "o.vdb", "--method", "anisotropic", "--sigma", "3,1"]).fails(2, &["sigma"]);
+    desk.run(&["smooth", "u.vdb", "-o", "o.vdb", "--sigma", "1,2"]).fails(2, &["sigma", "anisotropic"]);
+    desk.run(&["smooth", "u.vdb", "-o", "o.vdb", "--preserve-shape"]).fails(2, &["preserve_shape"]);
+    assert!(!desk.path("o.vdb").exists());
+}

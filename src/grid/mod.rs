@@ -77,6 +77,13 @@ impl Grid {
         Self { background: 0.0, topology: self.topology.clone(), values, masks: self.masks.clone() }
     }
 
+    /// As `zeroed`, with the active voxels of some leaves alone.
+    pub(crate) fn zeroed_on(&self, leaves: &LeafSet) -> Self {
+        let mut masks = Paged::filled(self.topology.page_count(), LeafMask::EMPTY);
+        masks.par_update(leaves, |id, mask: &mut LeafMask| *mask = self.mask(id));
+        Self { masks, ..self.zeroed() }
+    }
+
     /// A copy that shares nothing with this grid.
     pub fn deep_copy(&self) -> Self {
         let mut copy = self.clone();

@@ -4,7 +4,7 @@ use fearless_simd::{Simd, SimdBase, SimdMask};
 
 use super::{Field, LevelSet};
 use crate::error::Result;
-use crate::grid::{Grid, LEAF_VOXELS, LeafMask, LeafValues, PageLeaves};
+use crate::grid::{Grid, LEAF_VOXELS, LeafMask, LeafSet, LeafValues, PageLeaves};
 use crate::run::RunOptions;
 use crate::stencil::Halo;
 use crate::stencil::normals::curvatures;
@@ -32,14 +32,19 @@ const OPERATION: &str = "curvature";
 /// half width of 3, the least that level sets are made with, all eight corners of every cell that a plane cuts have one:
 /// for a unit normal n the farthest neighbour of a corner is at most Σ|nᵢ| + (the two largest |nᵢ|) ≤ 3 voxels away from it.
 pub fn curvature(level_set: &LevelSet, kind: CurvatureKind, run: &RunOptions) -> Result<Field> {
+    curvature_of(level_set, kind, level_set.grid().leaf_set(), run)
+}
+
+/// As [`curvature`], of some leaves alone: the voxels of others have no value.
+pub fn curvature_of(level_set: &LevelSet, kind: CurvatureKind, leaves: &LeafSet, run: &RunOptions) -> Result<Field> {
     let source = level_set.grid();
-    let bytes = source.leaves().len() as u64 * (size_of::<LeafValues>() + size_of::<LeafMask>()) as u64;
+    let bytes = leaves.len() as u64 * (size_of::<LeafValues>() + size_of::<LeafMask>()) as u64;
     run.reserve(OPERATION, bytes, "a coarser grid needs less")?;
-    let mut grid = source.zeroed();
+    let mut grid = source.zeroed_on(leaves);
     // All tasks read the neighbours: computed before they start, not by the first of them.
     source.neighbours();
     let voxel_size = level_set.voxel_size() as f32;
-    grid.update_pages(source.leaf_set(), |leaves, values, masks| {
+    grid.update_pages(leaves, |leaves, values, masks| {
         if !run.is_cancelled() {
             dispatch(Page { source, kind, voxel_size, leaves, values, masks });
         }

@@ -1,6 +1,8 @@
 //! The curve where two surfaces meet (Museth et al. 2002, section 4.2).
 
-use glam::{DAffine3, DVec3};
+use std::collections::HashMap;
+
+use glam::{DAffine3, DVec3, I64Vec3};
 
 use super::{LevelSet, Sampler};
 use crate::grid::offset_to_local;
@@ -44,6 +46,29 @@ impl LevelSet {
         });
         points.into_iter().flatten().collect()
     }
+}
+
+/// How far a point of a curve sees its neighbours when the length is measured, in voxels: a few of the points, which are a voxel apart at most.
+const SIGHT: f64 = 4.0;
+
+/// Length of the curve that the points of [`LevelSet::intersection_curve`] lie on, in their unit.
+///
+/// Points along a curve are counted by the kernel w(d) = max(0, 1 − d/ρ): its integral over the curve is ρ, so that a point
+/// stands for the length ρ/Σw. Nothing need be known of their order. On a curve of radius R the chords make that short by
+/// (ρ/R)²/48; points that lie irregularly add a few per cent of error.
+pub fn curve_length(points: &[DVec3], voxel_size: f64) -> f64 {
+    let sight = SIGHT * voxel_size;
+    let cell = |point: DVec3| (point / sight).floor().as_i64vec3();
+    let mut cells: HashMap<I64Vec3, Vec<DVec3>> = HashMap::new();
+    for &point in points {
+        cells.entry(cell(point)).or_default().push(point);
+    }
+    let stands_for = |&point: &DVec3| {
+        let beside = (0..27).map(|i| cell(point) + I64Vec3::new(i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1));
+        let near = beside.filter_map(|cell| cells.get(&cell)).flatten();
+        sight / near.map(|other| (1.0 - point.distance(*other) / sight).max(0.0)).sum::<f64>()
+    };
+    points.iter().map(stands_for).sum()
 }
 
 /// The point of the curve by `voxel`; the voxel itself where the surfaces are tangent; `None` if there is none nearby.
@@ -97,6 +122,8 @@ mod tests {
         angles.sort_by(f64::total_cmp);
         let gap = angles.windows(2).map(|w| w[1] - w[0]).fold(0.0, f64::max) * 16.0;
         assert!(angles.len() > 100 && gap < 1.05, "{gap}");
+        let length = curve_length(&points, 1.0) / (std::f64::consts::TAU * 16.0);
+        assert!((length - 1.0).abs() < 0.03, "{length}");
         assert!(a.intersection_curve(&ball(DVec3::X * 60.0, 5.0)).is_empty());
     }
 

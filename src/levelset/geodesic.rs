@@ -14,7 +14,6 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use glam::{DVec3, IVec3, Vec3};
-use rayon::prelude::*;
 
 use super::{Field, LevelSet, Sampler};
 use crate::error::{EditError, Result};

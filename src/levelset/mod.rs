@@ -29,7 +29,8 @@ use glam::{DVec3, IVec3};
 
 pub(crate) use build::{BYTES_A_LEAF, grid_of_leaves, grid_of_parts};
 pub use components::Components;
-pub use curvature::{CurvatureKind, curvature};
+pub use curvature::{CurvatureKind, curvature, curvature_of};
+pub use curve::curve_length;
 pub use field::Field;
 pub use geodesic::Geodesic;
 pub use measure::Measures;

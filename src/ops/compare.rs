@@ -83,16 +83,36 @@ pub fn compare(a: &LevelSet, b: &LevelSet, run: &RunOptions) -> Result<Compariso
 /// lattice.
 pub fn changed_voxels(before: Option<&LevelSet>, after: &LevelSet) -> u64 {
     match before {
-        Some(before) if before.transform() == after.transform() => {
-            let (a, b) = (before.grid(), after.grid());
-            let changed = |origin: IVec3| {
-                let (a, b) = (View::of(a, origin), View::of(b, origin));
-                (0..LEAF_VOXELS).filter(|&i| a.at(i) != b.at(i)).count() as u64
-            };
-            all_origins(a, b).into_par_iter().map(changed).sum()
-        }
+        Some(before) if before.transform() == after.transform() => change(before, after).voxels,
         _ => after.grid().active_voxels(),
     }
+}
+
+/// What changed between two level sets of one lattice.
+pub(super) struct Change {
+    /// Voxels whose value or activity differs.
+    pub voxels: u64,
+    /// Volume gained in world units: a voxel counts as inside with the part ½ − φ/h of it.
+    pub volume: f64,
+}
+
+/// What of `before` changed to become `after`. Pages that they share are not looked at.
+pub(super) fn change(before: &LevelSet, after: &LevelSet) -> Change {
+    let (a, b) = (before.grid(), after.grid());
+    let per_voxel = 1.0 / after.voxel_size();
+    let inside = |bits: u32| (0.5 - f64::from(f32::from_bits(bits)) * per_voxel).clamp(0.0, 1.0);
+    let of_leaf = |origin: IVec3| {
+        if a.find(origin) == b.find(origin) && a.shares_storage(b, a.find(origin)) {
+            return (0, 0.0);
+        }
+        let (a, b) = (View::of(a, origin), View::of(b, origin));
+        let changed = (0..LEAF_VOXELS).map(|i| (a.at(i), b.at(i))).filter(|(a, b)| a != b);
+        changed.fold((0, 0.0), |(voxels, volume), (a, b)| (voxels + 1, volume + (inside(b.0) - inside(a.0))))
+    };
+    // Summed in the order of leaves, so that threads do not show.
+    let leaves: Vec<(u64, f64)> = all_origins(a, b).into_par_iter().with_min_len(16).map(of_leaf).collect();
+    let (voxels, volume) = leaves.iter().fold((0, 0.0), |sum, leaf| (sum.0 + leaf.0, sum.1 + leaf.1));
+    Change { voxels, volume: volume * after.voxel_size().powi(3) }
 }
 
 fn signs(level_set: &LevelSet) -> Vec<(IVec3, i32)> {

@@ -122,6 +122,17 @@ impl CurvatureOptions {
 }
 
 impl CurvatureOptions {
+    /// Refuses a curvature other than `wanted`, which is what the operator is about.
+    pub(super) fn only(&self, operation: &str, wanted: FlowCurvature, accepted: &str) -> Result<()> {
+        match self.curvature {
+            Some(curvature) if curvature != wanted => {
+                let value = serde_json::to_value(curvature).unwrap_or_default();
+                Err(EditError::parameter(operation, "curvature", value, accepted))
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// The error for options that have no use here: they belong `where_to`.
     pub(super) fn misplaced(&self, operation: &str, where_to: &str) -> EditError {
         let (field, value) = match serde_json::to_value(self) {

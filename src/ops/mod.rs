@@ -5,12 +5,14 @@
 //! in [`REGISTRY`] and knows nothing of any one of them.
 
 pub mod advect;
+pub mod blend;
 pub mod compare;
 mod confine;
 pub mod csg;
 mod curvature;
 pub mod distance;
 pub mod emboss;
+pub mod fillet;
 mod keep;
 pub mod morphology;
 mod params;
@@ -18,6 +20,7 @@ mod registry;
 pub mod segment;
 mod sequence;
 pub mod shape;
+pub mod sharpen;
 pub mod smooth;
 pub mod smooth_csg;
 mod solver;

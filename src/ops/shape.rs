@@ -7,7 +7,7 @@
 
 use std::path::Path;
 
-use glam::DVec3;
+use glam::{BVec3, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -134,29 +134,37 @@ impl Operator for Shape {
         self.validate()?;
         let source = Source::parse(&self.spec)?;
         let size = self.resolved_voxel_size(&source)?;
-        let (lo, hi) = source.bounds()?;
         let solid = match source {
             Source::Solid(solid) => solid,
             Source::Patches { patches, thickness } => return self.of_patches(&patches, thickness, size, run),
         };
-        let margin = f64::from(self.half_width) + 2.0;
-        let bounds = ((lo / size - margin).floor().as_ivec3(), (hi / size + margin).ceil().as_ivec3());
-        let sample = |half_width: f32| {
-            LevelSet::from_distance(
-                Transform::uniform(size),
-                half_width,
-                bounds,
-                |ijk| solid.value(ijk * size) / size,
-                run,
-            )
-        };
-        if solid.is_distance() {
-            return Ok(sample(self.half_width)?.into());
-        }
-        // The implicit function is only about a distance: sampled in a band wide enough for its zero set, then made exact.
-        let rough = sample(SAMPLED_BAND)?;
-        Ok(rebuild(&rough, &Rebuild::band(self.half_width), run)?.into())
+        Ok(sampled(&solid, &Transform::uniform(size), self.half_width, run)?.into())
     }
+}
+
+/// A solid on a lattice.
+pub(super) fn sampled(
+    solid: &Expression,
+    transform: &Transform,
+    half_width: f32,
+    run: &RunOptions,
+) -> Result<LevelSet> {
+    let Some((lo, hi)) = solid.bounds() else { return Ok(LevelSet::empty(*transform, half_width)) };
+    let corners = (0..8).map(|c| DVec3::select(BVec3::new(c & 4 != 0, c & 2 != 0, c & 1 != 0), hi, lo));
+    let corners = corners.map(|corner| transform.world_to_index(corner));
+    let (lo, hi) = corners.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), c| (lo.min(c), hi.max(c)));
+    let margin = f64::from(half_width) + 2.0;
+    let bounds = ((lo - margin).floor().as_ivec3(), (hi + margin).ceil().as_ivec3());
+    let size = transform.voxel_size();
+    let sample = |half_width: f32| {
+        let distance = |ijk| solid.value(transform.index_to_world(ijk)) / size;
+        LevelSet::from_distance(*transform, half_width, bounds, distance, run)
+    };
+    if solid.is_distance() {
+        return sample(half_width);
+    }
+    // The implicit function is only about a distance: sampled in a band wide enough for its zero set, then made exact.
+    rebuild(&sample(SAMPLED_BAND)?, &Rebuild::band(half_width), run)
 }
 
 impl Shape {

@@ -25,12 +25,11 @@ use serde::{Deserialize, Serialize};
 use super::curvature::{CurvatureOptions, unresolved};
 use super::params::words;
 use super::registry::{Arity, Operator, Outcome};
-use super::solver::{EvolutionOptions, evolved};
+use super::solver::{EvolutionOptions, SMOOTHING, evolved};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::pde::{
-    AnisotropicGaussian, CurvatureFlow, Filter, FilterKind, Report, SolverOptions, SpeedFunction, UpwindScheme, evolve,
-    filter, filter_anisotropic,
+    AnisotropicGaussian, CurvatureFlow, Filter, FilterKind, Report, SpeedFunction, evolve, filter, filter_anisotropic,
 };
 use crate::run::RunOptions;
 use crate::stencil::FaceHalo;
@@ -92,9 +91,6 @@ impl Default for Smooth {
         }
     }
 }
-
-/// The cheapest that keeps the sphere of the module's comment within 0.05 voxel.
-const SOLVER: SolverOptions = SolverOptions { scheme: UpwindScheme::HjWeno5, ..SolverOptions::FIRST_ORDER };
 
 impl Operator for Smooth {
     const NAME: &'static str = "smooth";
@@ -189,7 +185,7 @@ pub fn smooth(level_set: &mut LevelSet, params: &Smooth, run: &RunOptions) -> Re
         let times = params.evolution.iterations.unwrap_or(1);
         return filter_anisotropic(level_set, &what, times, region, &params.evolution.solver(what.repair()), run);
     }
-    let (until, solver) = (params.evolution.until(), params.evolution.solver(SOLVER));
+    let (until, solver) = (params.evolution.until(), params.evolution.solver(SMOOTHING));
     if let Some(what) = params.filter() {
         return filter(level_set, what, params.evolution.iterations.unwrap_or(1), region, &solver, run);
     }

@@ -28,6 +28,10 @@ use crate::stencil::{FaceHalo, Halo};
 
 const OPERATION: &str = "anisotropic gaussian";
 
+/// Standard deviations, in voxels, of the isotropic Gaussians before normals and curvatures are taken where shapes are preserved.
+const NORMAL_SIGMA: f32 = 1.0;
+const BEND_SIGMA: f32 = 2.0;
+
 /// An anisotropic Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AnisotropicGaussian {
@@ -73,7 +77,9 @@ impl AnisotropicGaussian {
 
     /// The half width of the band that the kernels need, in voxels.
     pub fn needed_half_width(&self) -> f32 {
-        (2.5 * self.sigma[0] + 1.25).ceil().max(3.0)
+        // Curvatures are those of φ smoothed by two voxels in all directions.
+        let along = if self.critical_curvature.is_some() { self.sigma[0].max(BEND_SIGMA) } else { self.sigma[0] };
+        (2.5 * along + 1.25).ceil().max(3.0)
     }
 
     /// How far beyond the region the first two passes are computed, in voxels.
@@ -210,7 +216,7 @@ fn filtered(
         Some(_) => {
             // Differences of normals read one voxel beyond each, and kernels three standard deviations beyond that.
             let beyond = around.grown(grid, 2);
-            Some((isotropic(1.0, &beyond)?, isotropic(2.0, &beyond)?))
+            Some((isotropic(NORMAL_SIGMA, &beyond)?, isotropic(BEND_SIGMA, &beyond)?))
         }
     };
     let source = KernelSource {

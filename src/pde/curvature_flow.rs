@@ -13,6 +13,9 @@
 //! that smoothing by it is a (degenerate) parabolic flow: stable up to steps of h²/3 for H, of h²/6 for those with the weight of both curvatures.
 //! K itself has the unit 1/length² and does not grow with the matrix where K < 0: only its root is offered.
 //!
+//! On the way to rest (`Until::Rest`) the lower half of C is replaced by max(γ − l₀, 0)/γ ([`CutOff::excess`]): the flow by the excess of
+//! curvature rests where the other does and gets there in steps that do not overshoot.
+//!
 //! Curvatures are those of [`normals`](crate::stencil::normals), clamped to what the grid resolves, 0 where |∇φ| < 0.1. |∇φ| is
 //! Godunov's with the sign of the final F: a speed that is cut off or one-sided moves fronts, which central differences
 //! would smear. The plain mean curvature flow alone is parabolic everywhere and takes central differences.
@@ -77,9 +80,10 @@ impl CurvatureFlow {
         solver: &SolverOptions,
         run: &RunOptions,
     ) -> Result<Report> {
-        match *self == Self::MEAN {
-            true => evolve(level_set, &MeanCurvatureFlow, region, until, solver, run),
-            false => evolve(level_set, self, region, until, solver, run),
+        match until {
+            _ if *self == Self::MEAN => evolve(level_set, &MeanCurvatureFlow, region, until, solver, run),
+            Until::Rest(_) => evolve(level_set, &ToRest(*self), region, until, solver, run),
+            _ => evolve(level_set, self, region, until, solver, run),
         }
     }
 }
@@ -96,6 +100,24 @@ impl SpeedFunction for CurvatureFlow {
     fn rate<S: Simd>(&self, simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
         let (k, gamma) = self.curvature.of(simd, &curvatures(simd, halo, x, y, voxel_size), voxel_size);
         let speed = self.direction.constrain(simd, -k * self.cut_off.weights(simd, gamma));
+        speed * upwind_gradient(simd, halo, x, y, speed, voxel_size)
+    }
+}
+
+/// A flow by the excess of curvature over the lower limit.
+struct ToRest(CurvatureFlow);
+
+impl SpeedFunction for ToRest {
+    type Halo = Halo;
+
+    fn largest_step(&self, voxel_size: f64) -> f64 {
+        self.0.largest_step(voxel_size)
+    }
+
+    #[inline(always)]
+    fn rate<S: Simd>(&self, simd: S, halo: &Halo, x: usize, y: usize, voxel_size: f32) -> Lanes<S> {
+        let (k, gamma) = self.0.curvature.of(simd, &curvatures(simd, halo, x, y, voxel_size), voxel_size);
+        let speed = self.0.direction.constrain(simd, -k * self.0.cut_off.excess(simd, gamma));
         speed * upwind_gradient(simd, halo, x, y, speed, voxel_size)
     }
 }

@@ -4,6 +4,7 @@ use super::speed::{FlowStep, SpeedFunction};
 use super::step::Target;
 use super::{SolverOptions, TimeIntegrator, Tracker};
 use crate::error::{EditError, Result};
+use crate::grid::Grid;
 use crate::levelset::LevelSet;
 use crate::region::Region;
 use crate::run::RunOptions;
@@ -109,25 +110,32 @@ pub fn evolve(
     run: &RunOptions,
 ) -> Result<Report> {
     let voxel_size = level_set.voxel_size();
+    let rest = matches!(until, Until::Rest(_)).then(|| Rest { start: level_set.grid().clone(), reached: false });
     let mut tracker = Tracker::new(level_set, region, *solver, run);
-    let rest = matches!(until, Until::Rest(_)).then_some(false);
     drive(&mut tracker, &mut Flow { function, voxel_size, rest }, until)
 }
 
 /// Part of a step by which a time may exceed a whole number of steps without one more.
-const WHOLE_STEPS: f64 = 1e-9;
+pub(super) const WHOLE_STEPS: f64 = 1e-9;
 
 /// The motion that a speed function describes.
 struct Flow<'a, F> {
     function: &'a F,
     voxel_size: f64,
-    /// Whether it has come to rest, if that is to be looked for.
-    rest: Option<bool>,
+    /// If it goes on until it rests.
+    rest: Option<Rest>,
+}
+
+/// The state of a flow that goes on until it rests.
+struct Rest {
+    /// The field before.
+    start: Grid,
+    reached: bool,
 }
 
 impl<F: SpeedFunction> Motion for Flow<'_, F> {
     fn prepare(&mut self, _: &Tracker, left: f64) -> Option<f64> {
-        if self.rest == Some(true) {
+        if self.rest.as_ref().is_some_and(|rest| rest.reached) {
             return None;
         }
         let largest = self.function.largest_step(self.voxel_size);
@@ -143,7 +151,8 @@ impl<F: SpeedFunction> Motion for Flow<'_, F> {
         // Flows of curvature are first order in time: dt is bounded by stability, not by accuracy.
         tracker.integrate(&step, TimeIntegrator::TvdRk1, Target::Moving)?;
         if let Some(rest) = &mut self.rest {
-            *rest = tracker.last_change().is_rest(dt, self.voxel_size);
+            tracker.hold(&rest.start);
+            rest.reached = tracker.last_change().is_rest(dt, self.voxel_size);
         }
         Ok(())
     }

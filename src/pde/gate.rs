@@ -63,6 +63,23 @@ impl CutOff {
         low * self.high.map_or(1.0, |[a, b]| 1.0 - ramp_between(gamma, a, b))
     }
 
+    /// C(γ) with the lower half replaced by max(γ − l₀, 0)/γ: zero where C is, but γ times it has no slope above 1.
+    ///
+    /// For flows that go on until they rest. γ·P(γ; l₀, l₁) is steeper than γ by up to 5.5 for (0.04, 0.06): explicit steps that are stable
+    /// for γ overshoot there, a one-sided flow never takes that back, and P ~ 2β² makes the approach to l₀ algebraic.
+    #[inline(always)]
+    pub fn excess<S: Simd>(&self, simd: S, gamma: Lanes<S>) -> Lanes<S> {
+        let mut weight = Lanes::splat(simd, 1.0);
+        if let Some([least, _]) = self.low {
+            let above = (gamma - least as f32).max(Lanes::splat(simd, 0.0));
+            weight = above / gamma.max(Lanes::splat(simd, f32::MIN_POSITIVE));
+        }
+        if let Some(limits) = self.high {
+            weight *= Lanes::splat(simd, 1.0) - ramp(simd, gamma, limits);
+        }
+        weight
+    }
+
     /// C(γ) of sixteen voxels.
     #[inline(always)]
     pub fn weights<S: Simd>(&self, simd: S, gamma: Lanes<S>) -> Lanes<S> {

@@ -1,11 +1,18 @@
-//! Whether a flow has come to rest: how far its last step moved the field.
+//! Flows that go on until they rest: how far a step moved the surface, and what holds them at the rim of a region.
+//!
+//! A region's weight α slows a flow down. One that goes on until it rests has all the time it needs, and ends up as far from where it
+//! was at α = 0.01 as at α = 1: a cliff at the rim, where the voxels with α = 0 stay as they were. So such a flow is held:
+//!
+//! > |φ − φ₀| ≤ 2 · background · α/(1 − α),
+//!
+//! which is no bound from α = ½ on and lets nothing move where α vanishes.
 
 use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 use rayon::prelude::*;
 
 use super::Tracker;
 use super::domain::Domain;
-use crate::grid::{Grid, LeafValues, PageLeaves, Paged};
+use crate::grid::{Grid, LeafSet, LeafValues, PAGE_LEAVES, PageLeaves, Paged};
 use crate::stencil::simd::{Lanes, Work, dispatch};
 
 /// The fastest that a resting surface moves, in voxels a unit of time in voxels squared (F = −H moves a ball of 1000 voxels so).
@@ -14,7 +21,7 @@ const SLOWEST: f64 = 1e-3;
 /// region, a part of it that still moves is not lost in the mean.
 const SMALLEST: f64 = 1e-4;
 
-/// What a step changed.
+/// What a step changed at the surface: the voxels that are less than one away from it.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Change {
     /// Largest |Δφ| in voxels.
@@ -45,6 +52,31 @@ impl Change {
 }
 
 impl Tracker<'_> {
+    /// Holds φ near what it was at the start where the region's weight is small.
+    pub(super) fn hold(&mut self, start: &Grid) {
+        let Some(weights) = self.domain.weights() else { return };
+        let grid = &*self.grid;
+        // The slots of a leaf differ once leaves have come and gone.
+        let mut place = vec![None; grid.value_pages().page_count() * PAGE_LEAVES];
+        let mut rim = LeafSet::default();
+        for id in self.domain.leaves().iter() {
+            let (alpha, moving) = (&weights.alpha(id).0, self.domain.moving(id, grid.mask(id)));
+            if moving.iter().any(|at| alpha[at] < 0.5) {
+                place[id.index()] = Some(start.find(grid.origin(id)));
+                rim.insert(id);
+            }
+        }
+        let (domain, most) = (&self.domain, 2.0 * grid.background());
+        self.grid.update(&rim, |id, values, mask| {
+            let Some(before) = place[id.index()] else { return };
+            let (before, alpha) = (&start.values(before).0, &weights.alpha(id).0);
+            for at in domain.moving(id, *mask).iter().filter(|&at| alpha[at] < 0.5) {
+                let reach = most * alpha[at] / (1.0 - alpha[at]);
+                values.0[at] = values.0[at].clamp(before[at] - reach, before[at] + reach);
+            }
+        });
+    }
+
     /// What the last Euler step changed, region included; before the band is tracked.
     pub(super) fn last_change(&self) -> Change {
         // The step left the old field in the first buffer.
@@ -82,9 +114,11 @@ impl Work for PageChange<'_> {
                     #[inline(always)]
                     |x, y, bits| {
                         let at = x * 64 + y * 8;
-                        let (now, old) = (&now.0[at..at + 16], &old.0[at..at + 16]);
-                        let moved = (Lanes::from_slice(simd, now) - Lanes::from_slice(simd, old)).abs() * self.scale;
-                        let moved = mask32x16::from_bitmask(simd, u64::from(bits)).select(moved, zero);
+                        let now = Lanes::from_slice(simd, &now.0[at..at + 16]);
+                        let moved = (now - Lanes::from_slice(simd, &old.0[at..at + 16])).abs() * self.scale;
+                        let near = (now.abs() * self.scale).simd_lt(1.0);
+                        let counted = near & mask32x16::from_bitmask(simd, u64::from(bits));
+                        let moved = counted.select(moved, zero);
                         largest = largest.max(moved);
                         squares += moved * moved;
                         voxels += u64::from(moved.simd_gt(zero).to_bitmask().count_ones());

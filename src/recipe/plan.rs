@@ -278,6 +278,8 @@ impl Planner<'_, '_> {
             None => String::new(),
         };
         let names = |key: &Key, name: &str| key.name == name || parameter(key) == name;
+        // What a command calls its output is the path of a step.
+        let field = if field == "output" { "path" } else { field };
         // The grammars of shapes and regions do not know whose value they are.
         let of_grammar = |key: &Key| match operation.as_str() {
             "region" => names(key, "region"),

@@ -127,6 +127,9 @@ impl Default for Emboss {
 const SOLVER: SolverOptions =
     SolverOptions { scheme: UpwindScheme::HjWeno5, normalizations: 3, ..SolverOptions::FIRST_ORDER };
 
+/// Most steps where nothing is asked for: the approach to the limit is algebraic, not exponential.
+const MOST_ITERATIONS: u32 = 1000;
+
 /// How far a stamp stands out where nothing is asked for, in voxels.
 const DEFAULT_HEIGHT: f64 = 3.0;
 
@@ -417,7 +420,7 @@ impl Operator for Emboss {
         let mut outcome = evolved(level_set, run, |level_set| {
             let how = self.attraction(level_set)?;
             let (region, until, solver) =
-                (region.as_deref(), self.evolution.until_rest(), self.evolution.solver(SOLVER));
+                (region.as_deref(), self.evolution.until_rest(MOST_ITERATIONS), self.evolution.solver(SOLVER));
             let report = match source {
                 Source::Solid(_) => attract(level_set, &Solid::new(&tree), &how, region, until, &solver, run)?,
                 _ => attract(level_set, &Surface(&tree), &how, region, until, &solver, run)?,
