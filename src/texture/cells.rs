@@ -1,14 +1,20 @@
 //! The cells of a patch volume: the exact inverse of its map, folds, and distortion.
 
+use std::collections::BTreeSet;
+
 use glam::{DMat3, DVec3, IVec3};
 use rustc_hash::FxHashMap;
 use smallvec::SmallVec;
 
 use super::volume::Volume;
+use crate::grid::{LEAF_DIM, leaf_origin};
 
 /// Newton steps for the place in a cell, and how near they end, in voxels.
 const STEPS: usize = 12;
 const NEAR_ENOUGH: f64 = 1e-6;
+
+/// How far the map goes on around the patch, in cells.
+const RIM: f64 = 1.5;
 
 /// How far outside a cell, in its own coordinates, a place still counts as in it: cells share their faces.
 const SLACK: f64 = 1e-6;
@@ -54,6 +60,12 @@ impl Cell {
         None
     }
 
+    /// Whether it lies in 0..1³.
+    fn holds_texture(&self) -> bool {
+        let slack = DVec3::splat(SLACK);
+        self.low.cmpge(-slack).all() && self.high.cmple(1.0 + slack).all()
+    }
+
     fn bounds(&self) -> (DVec3, DVec3) {
         self.corners[1..].iter().fold((self.corners[0], self.corners[0]), |(lo, hi), &c| (lo.min(c), hi.max(c)))
     }
@@ -67,18 +79,27 @@ pub(super) struct Cells {
 }
 
 impl Cells {
-    /// The cells between two layers are those of both nets laid over each other, so that the map is trilinear in each.
+    /// The cells between two layers are those of both nets laid over each other, so that the map is trilinear in each. Around the patch, and above and
+    /// under it, there is one more cell, in which the map goes on: so distances to a texture that touches its box are known on both sides.
     pub fn new(volume: &Volume) -> Self {
         let mut cells = Vec::new();
-        let last = (volume.layers.len() - 1) as f64;
-        for (k, pair) in volume.layers.windows(2).enumerate() {
-            let (us, vs) = (merged(pair[0].counts[0], pair[1].counts[0]), merged(pair[0].counts[1], pair[1].counts[1]));
+        let n = volume.layers.len();
+        for k in 0..=n {
+            // The outermost ones continue the map of those beside them.
+            let low = k.clamp(1, n - 1) - 1;
+            let (below, above) = (&volume.layers[low], &volume.layers[low + 1]);
+            let (w0, w1) = (volume.levels[low], volume.levels[low + 1]);
+            let w = match k {
+                0 => [w0 - (w1 - w0) * RIM, w0],
+                k if k == n => [w1, w1 + (w1 - w0) * RIM],
+                _ => [w0, w1],
+            };
+            let at = |u: f64, v: f64, w: f64| below.bilinear(u, v).lerp(above.bilinear(u, v), (w - w0) / (w1 - w0));
+            let (us, vs) = (merged(below.counts[0], above.counts[0]), merged(below.counts[1], above.counts[1]));
             for u in us.windows(2) {
                 for v in vs.windows(2) {
-                    let corners = std::array::from_fn(|c| pair[c & 1].bilinear(u[c >> 2], v[c >> 1 & 1]));
-                    let low = DVec3::new(u[0], v[0], k as f64 / last);
-                    let high = DVec3::new(u[1], v[1], (k + 1) as f64 / last);
-                    cells.push(Cell { low, high, corners });
+                    let corners = std::array::from_fn(|c| at(u[c >> 2], v[c >> 1 & 1], w[c & 1]));
+                    cells.push(Cell { low: DVec3::new(u[0], v[0], w[0]), high: DVec3::new(u[1], v[1], w[1]), corners });
                 }
             }
         }
@@ -115,10 +136,36 @@ impl Cells {
         })
     }
 
+    /// First voxels of the leaves that the cells touch, in order.
+    pub fn leaves(&self) -> Vec<IVec3> {
+        let mut leaves = BTreeSet::new();
+        for cell in &self.cells {
+            let (lo, hi) = cell.bounds();
+            let (lo, hi) = (leaf_origin(lo.floor().as_ivec3()), leaf_origin(hi.ceil().as_ivec3()));
+            for x in (lo.x..=hi.x).step_by(LEAF_DIM as usize) {
+                for y in (lo.y..=hi.y).step_by(LEAF_DIM as usize) {
+                    leaves.extend((lo.z..=hi.z).step_by(LEAF_DIM as usize).map(|z| [x, y, z]));
+                }
+            }
+        }
+        leaves.into_iter().map(IVec3::from_array).collect()
+    }
+
+    /// The most that a step of a voxel moves in a texture of the given size: the largest singular value of the inverse, bounded by the norm of its columns.
+    pub fn largest_stretch(&self, size: DVec3) -> f64 {
+        let stretch = |cell: &Cell| {
+            let (_, by_t) = cell.at(DVec3::splat(0.5));
+            let inverse = DMat3::from_diagonal((cell.high - cell.low) * size) * by_t.inverse();
+            let columns = [inverse.x_axis, inverse.y_axis, inverse.z_axis];
+            columns.iter().map(|c| c.length_squared()).sum::<f64>().sqrt()
+        };
+        self.cells.iter().filter(|cell| cell.holds_texture()).map(stretch).filter(|s| s.is_finite()).fold(0.0, f64::max)
+    }
+
     /// Distortion of the map over target lengths of the whole edges u, v, w, in voxels.
     pub fn distortion(&self, lengths: DVec3) -> Distortion {
         let mut of_cells = Vec::with_capacity(self.cells.len());
-        for cell in &self.cells {
+        for cell in self.cells.iter().filter(|cell| cell.holds_texture()) {
             // Derivatives by lengths of the texture instead of by t.
             let unit = (cell.high - cell.low) * lengths;
             let (_, by_t) = cell.at(DVec3::splat(0.5));
@@ -141,9 +188,11 @@ impl Cells {
     }
 }
 
-/// Places in 0..1 at which one of two even divisions has a border.
+/// Places at which one of two even divisions of 0..1 has a border, and one cell more on both sides.
 fn merged(a: usize, b: usize) -> Vec<f64> {
+    let rim = RIM / a.max(b) as f64;
     let mut all: Vec<f64> = (0..=a).map(|i| i as f64 / a as f64).chain((0..=b).map(|i| i as f64 / b as f64)).collect();
+    all.extend([-rim, 1.0 + rim]);
     all.sort_by(f64::total_cmp);
     all.dedup_by(|a, b| (*a - *b).abs() < 1e-12);
     all
@@ -228,7 +277,8 @@ mod tests {
                 .collect();
             Net { counts: [nu, 4], points }
         };
-        Volume { layers: (0..layers).map(net).collect() }
+        let levels = (0..layers).map(|k| k as f64 / (layers - 1) as f64).collect();
+        Volume { layers: (0..layers).map(net).collect(), levels }
     }
 
     #[test]

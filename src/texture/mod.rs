@@ -8,5 +8,7 @@ mod level;
 mod patch;
 mod path;
 mod volume;
+mod wrap;
 
 pub use cells::{Distortion, Spread};
+pub use wrap::{Parameterization, Patch, Placement, wrapped};

@@ -51,12 +51,18 @@ impl Net {
         [along_u(0), along_u(nv), along_v(0), along_v(nu)]
     }
 
-    /// The point at (u, v) in 0..1, bilinear in its cell.
+    /// Lengths of the edges p1p2 and p1p4.
+    pub fn edges(&self) -> [f64; 2] {
+        let [bottom, _, left, _] = self.sides();
+        [length(&bottom), length(&left)]
+    }
+
+    /// The point at (u, v), bilinear in its cell; beyond 0..1 the cells at the border go on.
     pub fn bilinear(&self, u: f64, v: f64) -> DVec3 {
         let [nu, nv] = self.counts;
         let cell = |t: f64, n: usize| {
-            let at = t.clamp(0.0, 1.0) * n as f64;
-            let i = (at as usize).min(n - 1);
+            let at = t * n as f64;
+            let i = (at.max(0.0) as usize).min(n - 1);
             (i, at - i as f64)
         };
         let ((i, s), (j, t)) = (cell(u, nu), cell(v, nv));

@@ -10,20 +10,74 @@ use crate::levelset::LevelSet;
 /// Largest step of a particle, in voxels.
 const STEP: f64 = 0.5;
 
-/// Nets one above the other; layer k is at w = k/(layers − 1). Layers may have different numbers of cells. Positions in voxels.
+/// Most layers above the surface.
+const MOST_LAYERS: usize = 48;
+
+/// A direction that rises less than this with the surface is along it.
+const LEAST_SLOPE: f64 = 0.1;
+
+/// Nets one above the other, at rising values of w: 0 on the surface, 1 at the height, below 0 under the surface. Layers may have
+/// different numbers of cells. Positions in voxels.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Volume {
     pub layers: Vec<Net>,
+    pub levels: Vec<f64>,
+}
+
+/// Where the layers of a volume lie, in voxels above the surface, and which of them hold the texture.
+pub(super) struct Heights {
+    /// Falling from below 0.
+    below: Vec<f64>,
+    /// Rising from above 0.
+    above: Vec<f64>,
+    /// The heights of w = 0 and w = 1.
+    texture: [f64; 2],
+}
+
+impl Heights {
+    /// The texture stands `height` on the surface; one layer `depth` under it takes what sinks in.
+    pub fn raised(height: f64, depth: f64, spacing: f64) -> Self {
+        Self { below: vec![-depth], above: even(height, spacing), texture: [0.0, height] }
+    }
+
+    /// The texture reaches `height` down from the surface; one layer `depth` above it takes what stands out.
+    pub fn sunk(height: f64, depth: f64, spacing: f64) -> Self {
+        Self {
+            below: even(height, spacing).into_iter().map(|c| -c).collect(),
+            above: vec![depth],
+            texture: [-height, 0.0],
+        }
+    }
+
+    /// The volume of nets below, on and above the surface, in the order of these heights.
+    fn volume(&self, below: Vec<Net>, base: Net, above: Vec<Net>) -> Volume {
+        let [bottom, top] = self.texture;
+        let heights = self.below.iter().rev().copied().chain([0.0]).chain(self.above.iter().copied());
+        Volume {
+            layers: below.into_iter().rev().chain([base]).chain(above).collect(),
+            levels: heights.map(|c| (c - bottom) / (top - bottom)).collect(),
+        }
+    }
+}
+
+/// Steps of about `spacing` up to `height`.
+fn even(height: f64, spacing: f64) -> Vec<f64> {
+    let steps = ((height / spacing).ceil() as usize).clamp(1, MOST_LAYERS);
+    (1..=steps).map(|k| height * k as f64 / steps as f64).collect()
 }
 
 impl Volume {
-    /// Over `base`, on the levels of the field up to `height` voxels: each particle follows ∇φ. The band must reach two voxels
-    /// beyond the height. Particles keep their neighbours at every height, so cells widen over convex parts and narrow over concave ones.
-    pub fn conforming(field: &LevelSet, base: Net, height: f64, layers: usize) -> Self {
-        let paths: Vec<Vec<DVec3>> = base.points.par_iter().map(|&p| climb(field, p, height, layers, None)).collect();
-        let counts = base.counts;
-        let layer = |k| Net { counts, points: paths.iter().map(|path| path[k]).collect() };
-        Self { layers: (0..layers).map(layer).collect() }
+    /// Over `base`, on the levels of the field: each particle follows ∇φ. The band must reach two voxels beyond the levels. Particles keep
+    /// their neighbours at every height, so cells widen over convex parts and narrow over concave ones.
+    pub fn conforming(field: &LevelSet, base: Net, heights: &Heights) -> Self {
+        let nets = |levels: &[f64]| {
+            let climbed = |p: &DVec3| climb(field, *p, levels, None);
+            let paths: Vec<Vec<DVec3>> = base.points.par_iter().map(climbed).collect();
+            let net = |k| Net { counts: base.counts, points: paths.iter().map(|path| path[k]).collect() };
+            (0..levels.len()).map(net).collect::<Vec<_>>()
+        };
+        let (below, above) = (nets(&heights.below), nets(&heights.above));
+        heights.volume(below, base, above)
     }
 
     /// As [`conforming`](Self::conforming), but only the corners climb, along `directions` if there are any; between them each level gets a
@@ -31,39 +85,35 @@ impl Volume {
     pub fn low_distortion(
         field: &LevelSet,
         base: Net,
-        height: f64,
-        layers: usize,
+        heights: &Heights,
         spacing: f64,
         directions: Option<[DVec3; 4]>,
     ) -> Option<Self> {
-        let corners = base.corners();
-        let paths: [Vec<DVec3>; 4] =
-            std::array::from_fn(|c| climb(field, corners[c], height, layers, directions.map(|d| d[c])));
-        let mut nets = vec![base];
-        for k in 1..layers {
-            let level = Level::new(field, height * k as f64 / (layers - 1) as f64);
-            let corners = [0, 1, 2, 3].map(|c| paths[c][k]);
-            let net = patch(level, corners, spacing, nets.last())?;
-            nets.push(net);
-        }
-        Some(Self { layers: nets })
+        let nets = |levels: &[f64]| {
+            let climbed = |c: usize| climb(field, base.corners()[c], levels, directions.map(|d| d[c]));
+            let paths: [Vec<DVec3>; 4] = std::array::from_fn(climbed);
+            let mut nets: Vec<Net> = Vec::with_capacity(levels.len());
+            for (k, &height) in levels.iter().enumerate() {
+                let corners = [0, 1, 2, 3].map(|c| paths[c][k]);
+                nets.push(patch(Level::new(field, height), corners, spacing, Some(nets.last().unwrap_or(&base)))?);
+            }
+            Some(nets)
+        };
+        let (below, above) = (nets(&heights.below)?, nets(&heights.above)?);
+        Some(heights.volume(below, base, above))
     }
 
     /// The map from texture space: bilinear on the two layers around w, linear between them.
     pub fn at(&self, uvw: DVec3) -> DVec3 {
-        let last = self.layers.len() - 1;
-        let level = uvw.z.clamp(0.0, 1.0) * last as f64;
-        let k = (level as usize).min(last.saturating_sub(1));
-        let below = self.layers[k].bilinear(uvw.x, uvw.y);
-        match self.layers.get(k + 1) {
-            Some(above) => below.lerp(above.bilinear(uvw.x, uvw.y), level - k as f64),
-            None => below,
-        }
+        let above = self.levels.partition_point(|&w| w <= uvw.z).clamp(1, self.levels.len() - 1);
+        let (low, high) = (self.levels[above - 1], self.levels[above]);
+        let t = ((uvw.z - low) / (high - low)).clamp(0.0, 1.0);
+        self.layers[above - 1].bilinear(uvw.x, uvw.y).lerp(self.layers[above].bilinear(uvw.x, uvw.y), t)
     }
 }
 
-/// The places of a particle of the surface on the levels 0 … `height`, along ∇φ or a direction. It stays where the field has no slope.
-fn climb(field: &LevelSet, from: DVec3, height: f64, layers: usize, direction: Option<DVec3>) -> Vec<DVec3> {
+/// The places of a particle of the surface on levels that begin at 0 and rise, or fall, along ∇φ or a direction. It stays where the field has no slope.
+fn climb(field: &LevelSet, from: DVec3, levels: &[f64], direction: Option<DVec3>) -> Vec<DVec3> {
     let mut probe = Level::new(field, 0.0).probe();
     // dx/dc for the level c: unit speed through the levels.
     let mut velocity = |x: DVec3| {
@@ -71,25 +121,24 @@ fn climb(field: &LevelSet, from: DVec3, height: f64, layers: usize, direction: O
         match direction {
             Some(d) => {
                 let slope = d.dot(n);
-                (slope > 0.1).then(|| d / slope)
+                (slope > LEAST_SLOPE).then(|| d / slope)
             }
             None => Some(n),
         }
     };
     let mut settle = Level::new(field, 0.0).probe();
-    let mut path = vec![from];
+    let mut path = Vec::with_capacity(levels.len());
     let (mut x, mut c) = (from, 0.0);
-    for k in 1..layers {
-        let end = height * k as f64 / (layers - 1) as f64;
-        while c < end {
-            let step = STEP.min(end - c);
+    for &end in levels {
+        let steps = ((end - c) as f64).abs().div_euclid(STEP) as usize + 1;
+        let step = (end - c) / steps as f64;
+        for _ in 0..steps {
             c += step;
             let Some(v) = velocity(x) else { continue };
             let Some(v) = velocity(x + v * (0.5 * step)) else { continue };
             let moved = x + v * step;
             // Back to the level, without leaving the direction.
-            let off = c - settle.above(moved);
-            x = moved + v * off.clamp(-step, step);
+            x = moved + v * (c - settle.above(moved)).clamp(-step.abs(), step.abs());
         }
         path.push(x);
     }
@@ -121,10 +170,10 @@ mod tests {
         let plane = sampled(20, 10.0, |p| p.z - 0.25);
         let corner = |x: f64, y: f64| DVec3::new(x, y, 0.0);
         let base = over(&plane, [corner(-8.0, -6.0), corner(8.0, -6.0), corner(8.0, 6.0), corner(-8.0, 6.0)]);
-        let conforming = Volume::conforming(&plane, base.clone(), 6.0, 4);
-        let even = Volume::low_distortion(&plane, base, 6.0, 4, 2.0, None).unwrap();
+        let conforming = Volume::conforming(&plane, base.clone(), &Heights::raised(6.0, 2.0, 2.0));
+        let even = Volume::low_distortion(&plane, base, &Heights::raised(6.0, 2.0, 2.0), 2.0, None).unwrap();
         for volume in [conforming, even] {
-            for uvw in [DVec3::ZERO, DVec3::ONE, DVec3::new(0.3, 0.7, 0.4), DVec3::new(0.9, 0.1, 0.95)] {
+            for uvw in [DVec3::ZERO, DVec3::ONE, DVec3::new(0.3, 0.7, 0.4), DVec3::new(0.9, 0.1, -0.25)] {
                 let exact = DVec3::new(16.0 * uvw.x - 8.0, 12.0 * uvw.y - 6.0, 6.0 * uvw.z + 0.25);
                 assert!(volume.at(uvw).distance(exact) < 1e-3, "{uvw}");
             }
@@ -136,17 +185,17 @@ mod tests {
         let ball = sampled(34, 12.0, |p| p.length() - 16.0);
         let at = |x: f64, y: f64| DVec3::new(x, y, 1.0).normalize() * 16.0;
         let base = over(&ball, [at(-0.4, -0.4), at(0.4, -0.4), at(0.4, 0.4), at(-0.4, 0.4)]);
-        let volume = Volume::conforming(&ball, base.clone(), 8.0, 5);
-        for (k, net) in volume.layers.iter().enumerate() {
+        let volume = Volume::conforming(&ball, base.clone(), &Heights::raised(8.0, 2.0, 2.0));
+        for (net, w) in volume.layers.iter().zip(&volume.levels) {
             for (p, q) in base.points.iter().zip(&net.points) {
-                let radius = 16.0 + 2.0 * k as f64;
-                assert!(q.distance(*p / 16.0 * radius) < 0.06, "{k} {p} {q}");
+                let radius = 16.0 + 8.0 * w;
+                assert!(q.distance(*p / 16.0 * radius) < 0.06, "{w} {p} {q}");
             }
         }
         // The low-distortion net of a level has cells of the size asked for, hence more of them.
-        let even = Volume::low_distortion(&ball, base, 8.0, 5, 2.0, None).unwrap();
-        assert!(even.layers[4].counts[0] > even.layers[0].counts[0]);
-        assert!(even.layers[4].points.iter().all(|p| (p.length() - 24.0).abs() < 0.06));
+        let even = Volume::low_distortion(&ball, base, &Heights::raised(8.0, 2.0, 2.0), 2.0, None).unwrap();
+        assert!(even.layers[5].counts[0] > even.layers[0].counts[0]);
+        assert!(even.layers[5].points.iter().all(|p| (p.length() - 24.0).abs() < 0.06));
     }
 
     #[test]
@@ -155,7 +204,8 @@ mod tests {
         let corner = |x: f64, y: f64| DVec3::new(x, y, 0.0);
         let base = over(&plane, [corner(-6.0, -6.0), corner(6.0, -6.0), corner(6.0, 6.0), corner(-6.0, 6.0)]);
         let outwards = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)].map(|(x, y)| DVec3::new(x, y, 2.0));
-        let volume = Volume::low_distortion(&plane, base, 8.0, 5, 2.0, Some(outwards)).unwrap();
+        let volume =
+            Volume::low_distortion(&plane, base, &Heights::raised(8.0, 2.0, 2.0), 2.0, Some(outwards)).unwrap();
         assert!(volume.at(DVec3::new(1.0, 1.0, 1.0)).distance(DVec3::new(10.0, 10.0, 8.0)) < 1e-2);
         assert!(volume.at(DVec3::new(0.5, 0.5, 0.5)).distance(DVec3::new(0.0, 0.0, 4.0)) < 1e-2);
     }
