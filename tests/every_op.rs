@@ -25,7 +25,7 @@ fn needed(entry: &Entry) -> Map<String, Value> {
         "transform" => json!({ "steps": ["rotate z,30", "translate 0.123,0,0"] }),
         "segment" => json!({ "volume": scan(), "iso": 0.0 }),
         "emboss" => json!({ "points": points() }),
-        "warp" => json!({ "handle": ["1.1,0,0:1.2,0.1,0"], "fixed": ["-1,0,0", "0,1,0", "0,0,1"] }),
+        "warp" => json!({ "handle": ["1.1,0,0:1.11,0.01,0"], "fixed": ["-1,0,0", "0,1,0", "0,0,1"] }),
         "sweep" => json!({ "through": ["0,0,0", "0.2,0.1,0"] }),
         "advect" => json!({ "velocity": velocity(), "time": 0.004 }),
         _ => json!({}),

@@ -34,7 +34,7 @@ pub use from_levelset::level_set_to_mesh;
 pub use prepare::prepare;
 pub use quads::{QuadMesh, level_set_to_quads};
 pub(crate) use rebuild::rebuilt_leaves;
-pub use rebuild::{Rebuild, level_set_of_mesh, onto_lattice, rebuild, widened, with_half_width};
+pub use rebuild::{Rebuild, level_set_of_mesh, onto_lattice, rebuild, rebuild_where, widened, with_half_width};
 pub use scatter::{UnsignedLeaf, distance_to_triangles};
 pub use shell::shell;
 pub use simplify::{Bound, Simplified, simplify};

@@ -26,7 +26,7 @@ use crate::stencil::simd::dispatch;
 
 /// Voxels along the edge of a tile: its clusters fit the second-level cache, and those of its neighbours that it needs as well are
 /// as many as half its own.
-const TILE: i32 = 32;
+pub(crate) const TILE: i32 = 32;
 /// Voxels along the edge of the blocks whose voxels are computed one by one.
 const BLOCK: i32 = 4;
 

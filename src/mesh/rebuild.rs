@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
 use super::from_levelset::{leaves_the_band, surface_of};
-use super::nearest::{Band, Leaf, leaves_of_band};
+use super::nearest::{Band, Leaf, TILE, leaves_of_band};
 use super::{Bvh, MeshToLevelSet, TriangleMesh, level_set_to_mesh, mesh_to_level_set};
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, MAX_COORD, Transform};
@@ -111,6 +111,23 @@ pub fn widened(
     });
     parts.push(kept.collect());
     Ok(LevelSet::new(grid_of_parts(background, &parts), transform))
+}
+
+/// The same surface with exact distances in the tiles of space for whose first and last voxel `wanted` holds; all else stays as it is.
+pub fn rebuild_where(
+    level_set: &LevelSet,
+    wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
+    run: &RunOptions,
+) -> Result<LevelSet> {
+    let (field, half_width) = (level_set.grid(), level_set.half_width());
+    let mut parts = rebuilt_leaves(level_set, half_width, &wanted, run)?;
+    let stays = |origin: IVec3| {
+        let first = origin.div_euclid(IVec3::splat(TILE)) * TILE;
+        !wanted(first, first + (TILE - 1))
+    };
+    let others = field.leaves().par_iter().filter(|&&id| stays(field.origin(id)));
+    parts.push(others.map(|&id| (field.origin(id), field.values(id).clone(), field.mask(id))).collect());
+    Ok(LevelSet::new(grid_of_parts(level_set.background(), &parts), *level_set.transform()))
 }
 
 /// The leaves of a band of `half_width` voxels with exact distances, of boxes for whose first and last voxel `wanted` holds.

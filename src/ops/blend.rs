@@ -262,7 +262,7 @@ pub fn blend(first: &LevelSet, second: &LevelSet, params: &Blend, run: &RunOptio
     let flow = params.driven(voxel_size)?;
     let solver = params.evolution.solver(SMOOTHING);
     let outcome = evolved(joined.clone(), run, |level_set| match params.gaussian() {
-        None => held(level_set, Some(&*region), |moved| flow.evolve(moved, Some(&*region), until, &solver, run)),
+        None => held(level_set, Some(&*region), run, |moved| flow.evolve(moved, Some(&*region), until, &solver, run)),
         Some(what) => {
             let (times, solver) = (params.evolution.iterations.unwrap_or(1), params.evolution.solver(what.repair()));
             filter_anisotropic(level_set, &what, times, Some(&*region), &solver, run)

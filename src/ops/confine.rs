@@ -19,7 +19,7 @@ use crate::grid::{
     Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafSet, Transform, leaf_offset, leaf_origin, offset_to_local,
 };
 use crate::levelset::LevelSet;
-use crate::mesh::{Rebuild, rebuild, with_half_width};
+use crate::mesh::{Rebuild, rebuild, rebuild_where, with_half_width};
 use crate::pde::Report;
 use crate::region::{Region, RegionWeights};
 use crate::run::RunOptions;
@@ -158,11 +158,13 @@ impl Region for Leaves<'_> {
     }
 }
 
-/// Moves a level set by a flow that weighs its region itself; in a region, with the field beside voxels that stay cut as [`kept`] does.
-/// For flows that may pile material up at the region's rim, which renormalisation cannot repair against voxels that must not change.
+/// Moves a level set by a flow that weighs its region itself; in a region, with exact distances again at the end, and the field beside voxels
+/// that stay cut as [`kept`] does. For flows that come to rest at once where they are cut off, and may pile material up at the region's rim:
+/// few renormalisations, against voxels that must not change, leave no distance there.
 pub(super) fn held(
     level_set: &mut LevelSet,
     region: Option<&dyn Region>,
+    run: &RunOptions,
     flow: impl FnOnce(&mut LevelSet) -> Result<Report>,
 ) -> Result<Report> {
     let Some(region) = region else { return flow(level_set) };
@@ -170,8 +172,18 @@ pub(super) fn held(
     let report = flow(level_set)?;
     let nothing = LevelSet::empty(*original.transform(), original.half_width());
     let moved = std::mem::replace(level_set, nothing);
-    *level_set = if report.steps == 0 { moved } else { kept(&original, moved, region) };
+    *level_set = if report.steps == 0 { moved } else { kept(&original, restored(&moved, region, run)?, region) };
     Ok(report)
+}
+
+/// Exact distances where a region acts.
+fn restored(level_set: &LevelSet, region: &dyn Region, run: &RunOptions) -> Result<LevelSet> {
+    let around = IndexBox::around(region, level_set).map(|b| b.padded(f64::from(level_set.half_width()) + 1.0));
+    let touched = |first: IVec3, last: IVec3| {
+        let touches = |b: &IndexBox| first.as_dvec3().cmple(b.hi).all() && last.as_dvec3().cmpge(b.lo).all();
+        around.as_ref().is_none_or(touches)
+    };
+    rebuild_where(level_set, touched, run)
 }
 
 /// φ ← (1 − α) φ + α φ_new where α > 0.

@@ -128,5 +128,5 @@ pub fn fillet(level_set: &mut LevelSet, params: &Fillet, run: &RunOptions) -> Re
         None => params.evolution.until(),
     };
     let (region, solver) = (region.as_deref(), params.evolution.solver(SMOOTHING));
-    held(level_set, region, |moved| flow.evolve(moved, region, until, &solver, run))
+    held(level_set, region, run, |moved| flow.evolve(moved, region, until, &solver, run))
 }

@@ -80,5 +80,5 @@ pub fn sharpen(level_set: &mut LevelSet, params: &Sharpen, run: &RunOptions) -> 
     let region = params.evolution.region.on(level_set, run)?;
     let (until, solver) = (params.evolution.until(), params.evolution.solver(SMOOTHING));
     let (flow, region) = (params.driven()?, region.as_deref());
-    held(level_set, region, |moved| pde::sharpen(moved, &flow, reach, region, until, &solver, run))
+    held(level_set, region, run, |moved| pde::sharpen(moved, &flow, reach, region, until, &solver, run))
 }

@@ -196,7 +196,7 @@ pub fn smooth(level_set: &mut LevelSet, params: &Smooth, run: &RunOptions) -> Re
             let flow = params.flow.flow(Smooth::NAME, CurvatureFlow::MEAN)?;
             // Uncut mean curvature flow takes no material anywhere that it does not spread.
             let rim = region.filter(|_| flow != CurvatureFlow::MEAN);
-            held(level_set, rim, |moved| flow.evolve(moved, region, until, &solver, run))
+            held(level_set, rim, run, |moved| flow.evolve(moved, region, until, &solver, run))
         }
     }
 }
