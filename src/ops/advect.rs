@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::confine::held;
 use super::registry::{Arity, Operator, Outcome};
 use super::solver::{EvolutionOptions, evolved};
 use crate::error::{EditError, Result};
@@ -56,7 +57,8 @@ impl Operator for Advect {
         let until = if asked { self.evolution.until() } else { Until::Time(1.0) };
         let region = self.evolution.region.on(&inputs[0], run)?;
         let mut outcome = evolved(inputs.remove(0), run, |level_set| {
-            advect(level_set, &velocity, region.as_deref(), until, &self.evolution.solver(SOLVER), run)
+            let (region, solver) = (region.as_deref(), self.evolution.solver(SOLVER));
+            held(level_set, region, run, |moved| advect(moved, &velocity, region, until, &solver, run))
         })?;
         if outcome.summary.steps == Some(0) && outcome.summary.warnings.is_empty() {
             outcome.summary.warnings.push("the velocity is 0 wherever the surface is: nothing was changed".into());
