@@ -1,6 +1,6 @@
 //! Sharpening: curvature flow run backwards, F = +C(γ)·k̄ (Museth et al. 2002, equation 9), in steps of h²/6.
 //!
-//! Backwards the flow is ill-posed. [`pde::sharpen`](crate::pde::sharpen) says what makes it bearable, and with what evidence: k̄ is a mean of the
+//! Backwards the flow is ill-posed. [`pde::sharpen`] says what makes it bearable, and with what evidence: k̄ is a mean of the
 //! curvature over 3×3×3 voxels, nothing is made sharper than the upper limits (0.15 to 0.25/voxel if none are given), and the
 //! surface stays within `max_displacement` of where it was. Noise is not made smooth: it grows as well, but less than what is larger.
 

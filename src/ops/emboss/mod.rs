@@ -5,7 +5,7 @@
 //! closest point, without sampling.
 //!
 //! *Stamps* do not flow: a layer of exact height over the outline, laid on the surface by the exponential map around a point, is united with the solid or
-//! cut out of it ([`stamp`]). Their edges are as sharp as the voxels allow, which a flow's are not.
+//! cut out of it (`stamp`). Their edges are as sharp as the voxels allow, which a flow's are not.
 
 mod outline;
 mod patch;
