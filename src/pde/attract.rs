@@ -16,6 +16,9 @@
 //! quarter of a voxel, each on a field whose distances are restored from its zero set by [`sweep_distance`] in a band as wide as the stencils
 //! reach. Voxels beside the surface alone are moved; all others are new in each step. The band of the result is rebuilt exactly.
 //!
+//! **Experimental.** On models with detail the sweeps leave terraces of about a voxel wherever the crop is touched (a teapot of 256 voxels with 3264
+//! points: 3120 reached, a valid result, but a rough one). Smooth surfaces and few targets fare better.
+//!
 //! Sweeping rounds sharp edges by up to a voxel in the leaves around what moves. A target deep inside draws all sides that face it, not the
 //! nearest alone: a region holds the others.
 //!
