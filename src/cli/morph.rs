@@ -8,13 +8,15 @@ use serde_json::{Map, Value, json};
 
 use super::context::Context;
 use super::{Verb, args, files, options, render, table};
+use crate::atomic::write_atomically;
 use crate::error::{EditError, Result};
 use crate::files::frames::numbered;
 use crate::files::input;
 use crate::files::mesh_output::MeshParams;
 use crate::files::output::{self, Output};
 use crate::levelset::LevelSet;
-use crate::ops::morph::{FrameFacts, Morph, Sequence};
+use crate::mesh::{MeshFormat, TriangleMesh, level_set_to_mesh, transfer_attributes};
+use crate::ops::morph::{Align, FrameFacts, Morph, Sequence};
 use crate::ops::{Entry, find, parse};
 use crate::render::{ColorBy, Frame, Image, RenderOptions, render as draw};
 
@@ -27,6 +29,9 @@ const OF_ONE_RESULT: [&str; 2] = ["at", "attributes-from"];
 /// Pixels of frames that are pictures, and of each of those side by side in a preview.
 const PICTURE: [u32; 2] = [1280, 960];
 const SMALL_PICTURE: [u32; 2] = [480, 400];
+
+/// Of an animation.
+const FRAMES_A_SECOND: u16 = 24;
 
 /// Pictures in a preview.
 const PREVIEWED: usize = 5;
@@ -78,11 +83,12 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let mut planned = plan(&params, matches)?;
     let preview = picture(matches, "preview")?;
     let plot = picture(matches, "plot")?;
+    let animation = picture(matches, "animation")?;
     if args::flag(matches, "dry-run") {
         return dry_run(values, &input::probe(&paths, &input_options)?, &planned, context);
     }
     let pattern = args::paths(matches, "output").pop().unwrap_or_default().display().to_string();
-    if preview.is_none() && plot.is_none() && planned.iter().all(|frame| frame.kept) {
+    if preview.is_none() && plot.is_none() && animation.is_none() && planned.iter().all(|frame| frame.kept) {
         let value = json!({
             "operation": VERB.name, "output": pattern, "seconds": began.elapsed().as_secs_f64(), "frames": [],
             "warnings": [], "skipped": planned.len(),
@@ -106,7 +112,8 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     };
     let from = inputs.iter().find_map(|input| input.from());
     let check = args::flag(matches, "check");
-    let (mut facts, mut strip, mut bytes) = (Vec::new(), Vec::new(), 0);
+    let colors = Colors::of(&paths, &planned, &params, &mut warnings)?;
+    let (mut facts, mut strip, mut moving, mut bytes) = (Vec::new(), Vec::new(), Vec::new(), 0);
     let last = planned.len() - 1;
     let mut first_and_last = [None, None];
     let report = sequence.frames(&places, &mut |n, level_set, frame_facts| {
@@ -117,11 +124,18 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         if preview.is_some() && (0..PREVIEWED).any(|k| k * last / (PREVIEWED - 1) == n) {
             strip.push(picture_of(&level_set, SMALL_PICTURE)?);
         }
+        if animation.is_some() {
+            moving.push(picture_of(&level_set, SMALL_PICTURE)?);
+        }
         if !frame.kept {
             if check {
                 output::verify(VERB.name, &level_set)?;
             }
             match &frame.output {
+                Some(output) if output.is_mesh() && colors.carries(&frame_facts) => {
+                    let mesh = colors.painted(&level_set, &frame_facts, context)?;
+                    bytes += output.write_mesh(mesh, &context.run)?.bytes.unwrap_or(0);
+                }
                 Some(output) => {
                     let written = output.write(&level_set, 0.0, from, &context.run)?;
                     bytes += written.bytes.unwrap_or(0);
@@ -137,6 +151,9 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     })?;
     if let Some(path) = &preview {
         render::write(path, &Image::side_by_side(&strip))?;
+    }
+    if let Some(path) = &animation {
+        write_atomically(path, |out| Image::write_animation(&moving, FRAMES_A_SECOND, out))?;
     }
     if let Some(path) = &plot {
         render::write(path, &plotted(&facts))?;
@@ -174,6 +191,68 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         object.extend(summary.details);
     }
     context.reporter.result(&value, || text(&pattern, seconds, &facts, &planned, params.frame_start, summary.steps))
+}
+
+/// The colours of the shapes, where they came as meshes with colours.
+struct Colors(Vec<Option<TriangleMesh>>);
+
+impl Colors {
+    /// Those that the frames can hold. Shapes that are laid over each other by a transformation keep none: colours are found at the closest points in the world.
+    fn of(paths: &[PathBuf], planned: &[Planned], params: &Morph, warnings: &mut Vec<String>) -> Result<Self> {
+        let holds = planned.first().is_some_and(|frame| {
+            MeshFormat::of(&frame.path).is_some_and(MeshFormat::has_attributes) && frame.output.is_some()
+        });
+        if !holds {
+            return Ok(Self(Vec::new()));
+        }
+        let mut colors = Vec::new();
+        for path in paths {
+            let mesh = match input::is_volume(path) {
+                true => None,
+                false => Some(input::read_mesh(path, &mut Vec::new())?).filter(|mesh| mesh.colors.is_some()),
+            };
+            colors.push(mesh);
+        }
+        let posed = params.align != Align::None || params.transform.is_some() || params.landmarks.is_some();
+        if posed && colors.iter().any(Option::is_some) {
+            warnings.push("colours are lost: they are not carried through a transformation".into());
+            colors.clear();
+        }
+        Ok(Self(colors))
+    }
+
+    fn around(&self, facts: &FrameFacts) -> [Option<&TriangleMesh>; 2] {
+        let leg = facts.place.0;
+        [self.0.get(leg).and_then(Option::as_ref), self.0.get(leg + 1).and_then(Option::as_ref)]
+    }
+
+    /// Whether a frame has colours.
+    fn carries(&self, facts: &FrameFacts) -> bool {
+        self.around(facts).iter().any(Option::is_some)
+    }
+
+    /// The mesh of a frame: each vertex has the colours of the closest points of both shapes, mixed as far as the frame has gone (Breen, Mauch &
+    /// Whitaker 2000), or that of the one that has any.
+    fn painted(&self, level_set: &LevelSet, facts: &FrameFacts, context: &Context) -> Result<TriangleMesh> {
+        let mut mesh = level_set_to_mesh(level_set, 0.0, &context.run)?;
+        let mut found = Vec::new();
+        for (source, share) in self.around(facts).into_iter().zip([1.0 - facts.place.1, facts.place.1]) {
+            if let Some(source) = source {
+                let colors = transfer_attributes(source, &mesh.positions, &context.run)?.colors;
+                found.extend(colors.map(|colors| (colors, share as f32)));
+            }
+        }
+        mesh.colors = match &found[..] {
+            [(a, share), (b, _)] => Some(a.iter().zip(b).map(|(a, b)| mixed(*a, *b, *share)).collect()),
+            [(only, _)] => Some(only.clone()),
+            _ => None,
+        };
+        Ok(mesh)
+    }
+}
+
+fn mixed(a: [f32; 4], b: [f32; 4], share: f32) -> [f32; 4] {
+    std::array::from_fn(|k| share * a[k] + (1.0 - share) * b[k])
 }
 
 /// The files of all frames, refused now if they could not be written later.
@@ -277,13 +356,13 @@ fn plotted(facts: &[FrameFacts]) -> Image {
         line([x(n), bottom], [x(n), bottom + 5.0], 0.0, [60; 3]);
     }
     line([RIM, RIM], [RIM, bottom], 0.0, [60; 3]);
-    let curves: [(fn(&FrameFacts) -> f64, [u8; 3]); 2] =
-        [(|f| f.rms_voxels, [31, 119, 180]), (|f| f.shared_volume, [255, 127, 14])];
-    for (of, color) in curves {
-        let most = facts.iter().map(of).fold(f64::MIN_POSITIVE, f64::max);
-        let y = |f: &FrameFacts| bottom - (bottom - RIM) * (of(f) / most).clamp(0.0, 1.0);
-        for (n, pair) in facts.windows(2).enumerate() {
-            line([x(n), y(&pair[0])], [x(n + 1), y(&pair[1])], 2.0, color);
+    let values: [Vec<f64>; 2] =
+        [facts.iter().map(|f| f.rms_voxels).collect(), facts.iter().map(|f| f.shared_volume).collect()];
+    for (values, color) in values.iter().zip([[31, 119, 180], [255, 127, 14]]) {
+        let most = values.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
+        let y = |value: f64| bottom - (bottom - RIM) * (value / most).clamp(0.0, 1.0);
+        for (n, pair) in values.windows(2).enumerate() {
+            line([x(n), y(pair[0])], [x(n + 1), y(pair[1])], 2.0, color);
         }
     }
     Image { width: width as u32, height: height as u32, rgba8 }

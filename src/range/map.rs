@@ -148,7 +148,70 @@ pub enum Seen {
     },
 }
 
+/// What a map says of all points of a ball.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Around {
+    /// The ball is outside of its picture.
+    Outside,
+    /// No ray through it has a measurement.
+    Invalid,
+    /// All of it is in front of what was measured.
+    InFront,
+    /// All of it is behind.
+    Behind,
+    /// One thing here, another there.
+    Mixed,
+}
+
 impl RangeMap {
+    /// What it says of the points up to `radius` from a point of the world, `clear` being how far from what was measured they have to be.
+    pub fn look_around(&self, to_scanner: &DAffine3, xyz: DVec3, radius: f64, clear: f64) -> Around {
+        let p = to_scanner.transform_point3(xyz);
+        let Some((_, range)) = self.projection.project(p) else { return Around::Mixed };
+        let (mut lo, mut hi) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        for corner in 0..8 {
+            let side = |bit: i32| if corner & bit == 0 { -radius } else { radius };
+            match self.projection.project(p + DVec3::new(side(1), side(2), side(4))) {
+                Some((pixel, _)) => (lo, hi) = (lo.min(pixel), hi.max(pixel)),
+                None => return Around::Mixed,
+            }
+        }
+        // A pixel more: between pixels four of them count.
+        let (lo, hi) = ((lo - 1.0).floor(), (hi + 1.0).ceil());
+        let size = DVec2::new(self.width as f64, self.height as f64);
+        if hi.cmplt(DVec2::ZERO).any() || lo.cmpge(size).any() {
+            // Turning heads see round the back as well.
+            return if matches!(self.projection, Projection::Spherical { .. }) {
+                Around::Mixed
+            } else {
+                Around::Outside
+            };
+        }
+        if !(lo.cmpge(DVec2::ZERO).all() && hi.cmplt(size).all()) || (hi - lo).element_product() > 4096.0 {
+            return Around::Mixed;
+        }
+        let (mut least, mut most, mut valid, mut all) = (f32::INFINITY, f32::NEG_INFINITY, 0, 0);
+        for v in lo.y as usize..=hi.y as usize {
+            for range in &self.ranges[v * self.width + lo.x as usize..=v * self.width + hi.x as usize] {
+                all += 1;
+                if !range.is_nan() {
+                    (least, most, valid) = (least.min(*range), most.max(*range), valid + 1);
+                }
+            }
+        }
+        if valid == 0 {
+            Around::Invalid
+        } else if valid < all {
+            Around::Mixed
+        } else if f64::from(least) - range - radius > clear {
+            Around::InFront
+        } else if range - radius - f64::from(most) > clear {
+            Around::Behind
+        } else {
+            Around::Mixed
+        }
+    }
+
     /// The range at a pixel, NaN where there is none.
     pub fn range(&self, u: usize, v: usize) -> f32 {
         self.ranges.get(v * self.width + u).copied().filter(|_| u < self.width).unwrap_or(f32::NAN)

@@ -18,4 +18,4 @@ mod tests;
 mod toml;
 
 pub use files::RangeSet;
-pub use map::{Background, MOST_PIXELS, Projection, RangeMap, Seen, draw_parallel, is_rigid};
+pub use map::{Around, Background, MOST_PIXELS, Projection, RangeMap, Seen, draw_parallel, is_rigid};

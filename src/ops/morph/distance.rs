@@ -75,13 +75,18 @@ impl TargetDistance {
 
     /// The distance at a position; `sampler` is one of the level set.
     pub fn at(&self, sampler: &mut Sampler, ijk: DVec3) -> f64 {
-        let near = f64::from(sampler.trilinear(ijk));
         let own = OWN * f64::from(self.near.background());
+        let far = self.far_at(ijk);
+        // So far away that neither the sign nor the band can be otherwise.
+        if far.abs() > own + 2.0 * f64::from(self.spacing) * self.near.voxel_size() {
+            return far;
+        }
+        let near = f64::from(sampler.trilinear(ijk));
         if near.abs() < own {
             return near;
         }
         // The sign is the level set's: the lattice does not see what is thinner than its spacing.
-        near.signum() * self.far_at(ijk).abs().max(own)
+        near.signum() * far.abs().max(own)
     }
 
     fn far_at(&self, ijk: DVec3) -> f64 {

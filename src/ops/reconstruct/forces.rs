@@ -12,7 +12,7 @@ use crate::grid::{Grid, LEAF_DIM, LeafMask, LeafValues, Transform, offset_to_loc
 use crate::levelset::{LevelSet, background};
 use crate::mesh::{TriangleMesh, level_set_of_mesh, level_set_to_mesh};
 use crate::pde::{LeafSurface, SurfaceSpeed, Tally};
-use crate::range::{RangeMap, Seen};
+use crate::range::{Around, Background, RangeMap, Seen};
 use crate::run::RunOptions;
 
 /// The window is cut off at so many times its width.
@@ -152,31 +152,58 @@ impl SurfaceSpeed for Forces<'_> {
     }
 }
 
-/// φ₀ at a point, world units: Σ c μ w D / Σ c μ w where the maps say enough; else outside where a map sees through, inside where none does.
-fn first_value(terms: &[Term], xyz: DVec3, background: f64) -> f64 {
-    let (mut sum, mut weights) = (0.0, 0.0);
-    let (mut in_front, mut empty, mut behind) = (false, 0, 0);
-    let mut surely_empty = false;
-    for term in terms {
-        match term.at(xyz) {
-            Look::Unseen => {
-                // A ray without an answer is a vote, not a proof.
-                empty += usize::from(term.frames(xyz));
-            }
-            Look::Empty => surely_empty = true,
-            Look::InFront(weight) => in_front |= weight > 0.0,
-            Look::Behind => behind += 1,
-            Look::Near { distance, weight, .. } => {
-                sum += weight * distance;
-                weights += weight;
-                in_front |= distance > 0.0 && weight > 0.0;
+/// What maps say of all voxels of a leaf at once, and the maps that must be asked voxel by voxel.
+#[derive(Default)]
+struct Votes<'t, 'a> {
+    in_front: bool,
+    empty: usize,
+    behind: usize,
+    surely_empty: bool,
+    mixed: Vec<&'t Term<'a>>,
+}
+
+impl<'t, 'a> Votes<'t, 'a> {
+    /// Of the voxels around a point, up to `radius` away.
+    fn new(terms: &'t [Term<'a>], centre: DVec3, radius: f64) -> Self {
+        let mut votes = Self::default();
+        for term in terms {
+            match term.map.look_around(&term.to_scanner, centre, radius, CUT * term.width) {
+                Around::Outside => {}
+                Around::Invalid => match term.map.background {
+                    Background::Empty => votes.surely_empty = true,
+                    Background::Unknown => votes.empty += 1,
+                },
+                Around::InFront => votes.in_front = true,
+                Around::Behind => votes.behind += 1,
+                Around::Mixed => votes.mixed.push(term),
             }
         }
+        votes
     }
-    if weights > ENOUGH {
-        return (sum / weights).clamp(-background, background);
+
+    /// φ₀ at a point, world units: Σ c μ w D / Σ c μ w where the maps say enough; else outside where a map sees through, inside where none does.
+    fn value(&self, xyz: DVec3, background: f64) -> f64 {
+        let (mut sum, mut weights) = (0.0, 0.0);
+        let Self { mut in_front, mut empty, mut behind, mut surely_empty, .. } = *self;
+        for term in &self.mixed {
+            match term.at(xyz) {
+                // A ray without an answer is a vote, not a proof.
+                Look::Unseen => empty += usize::from(term.frames(xyz)),
+                Look::Empty => surely_empty = true,
+                Look::InFront(weight) => in_front |= weight > 0.0,
+                Look::Behind => behind += 1,
+                Look::Near { distance, weight, .. } => {
+                    sum += weight * distance;
+                    weights += weight;
+                    in_front |= distance > 0.0 && weight > 0.0;
+                }
+            }
+        }
+        if weights > ENOUGH {
+            return (sum / weights).clamp(-background, background);
+        }
+        if in_front || surely_empty || empty > behind { background } else { -background }
     }
-    if in_front || surely_empty || empty > behind { background } else { -background }
 }
 
 impl Term<'_> {
@@ -211,12 +238,15 @@ pub(super) fn first_surface(
     let values_of = |n: usize| {
         let origin = (first + place_of(n)) * LEAF_DIM;
         let mut values = LeafValues::default();
+        let half = f64::from(LEAF_DIM - 1) / 2.0;
+        let centre = transform.index_to_world(origin.as_dvec3() + half);
+        let votes = Votes::new(terms, centre, half * 3f64.sqrt() * transform.voxel_size());
         for (at, value) in values.0.iter_mut().enumerate() {
             let ijk = origin + offset_to_local(at);
             // The box closes what no map does.
             let within = ijk.cmpgt(lo).all() && ijk.cmplt(hi).all();
             *value = match within {
-                true => first_value(terms, transform.voxel_to_world(ijk), f64::from(background)) as f32,
+                true => votes.value(transform.voxel_to_world(ijk), f64::from(background)) as f32,
                 false => background,
             };
         }

@@ -190,7 +190,8 @@ pub fn reconstruct(set: RangeSet, params: &Reconstruct, run: &RunOptions) -> Res
     let reference = sorted[sorted.len() / 2];
     let lattice = |p: DVec3| transform.world_to_index(p);
     let (lo, hi) = (lattice(bounds.0) - MARGIN, lattice(bounds.1) + MARGIN);
-    if !(lo.abs().max(hi.abs()).max_element() < 1e9) {
+    let farthest = lo.abs().max(hi.abs()).max_element();
+    if farthest.is_nan() || farthest > 1e9 {
         return Err(EditError::parameter(
             NAME,
             "voxel_size",

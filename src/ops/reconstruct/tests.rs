@@ -131,6 +131,76 @@ fn without_noise_and_prior_the_torus_is_met() {
     assert!(rms < 0.1, "{rms}");
 }
 
+/// A hall of 9 x 4.4 x 5.2 with a table, a column and a ball; positive in the air.
+fn hall(p: DVec3) -> f64 {
+    let cuboid = |centre: DVec3, half: DVec3| {
+        let q = (p - centre).abs() - half;
+        q.max(DVec3::ZERO).length() + q.max_element().min(0.0)
+    };
+    let walls = -cuboid(DVec3::ZERO, DVec3::new(4.5, 2.2, 2.6));
+    let table = cuboid(DVec3::new(1.5, -1.2, 0.3), DVec3::new(0.9, 1.0, 0.6));
+    let column = p.truncate().distance(DVec2::new(-1.8, 0.3)) - 0.4;
+    let ball = p.distance(DVec3::new(-3.2, -1.4, 1.4)) - 0.7;
+    walls.min(table).min(column).min(ball)
+}
+
+#[test]
+fn a_hall_seen_by_twelve_turning_scanners() {
+    let (columns, rows, noise) = (160, 70, 0.05);
+    let mut random = Noise(7);
+    let mut maps = Vec::new();
+    for n in 0..12 {
+        let place =
+            DVec3::new(f64::from(n % 4) * 2.3 - 3.5, [1.2, -0.3, 1.6][n as usize / 4], f64::from(n % 3) * 0.9 - 1.0);
+        if hall(place) < 0.3 {
+            continue;
+        }
+        let step = DVec2::new(std::f64::consts::TAU / f64::from(columns), 2.8 / f64::from(rows));
+        let projection = Projection::Spherical { first: DVec2::new(-3.0, -1.4), step };
+        let pose = DAffine3::from_rotation_translation(glam::DQuat::from_rotation_z(f64::from(n)), place);
+        let mut ranges = Vec::new();
+        for v in 0..rows {
+            for u in 0..columns {
+                let direction = projection.point(DVec2::new(f64::from(u), f64::from(v)), 1.0);
+                let direction = pose.transform_vector3(direction);
+                let mut t = 0.0;
+                for _ in 0..100 {
+                    t += hall(place + direction * t);
+                }
+                ranges.push((t + noise * random.normal()) as f32);
+            }
+        }
+        maps.push(RangeMap {
+            name: format!("scanner {n}"),
+            projection,
+            pose,
+            width: columns as usize,
+            height: rows as usize,
+            weights: vec![1.0; ranges.len()],
+            ranges,
+            noise: Some(noise),
+            background: Background::Unknown,
+        });
+    }
+    let params =
+        Reconstruct { voxel_size: Some(WorldLength::new(0.12)), iterations: 32, beta: 0.5, ..Reconstruct::default() };
+    let (level_set, summary) = made(RangeSet { maps, ..RangeSet::default() }, &params);
+    let mesh = level_set_to_mesh(&level_set, 0.0, &RunOptions::default()).unwrap();
+    let near: Vec<f64> = mesh.positions.iter().map(|p| hall(*p) / 0.12).filter(|d| d.abs() < 2.0).collect();
+    let rms = (near.iter().map(|d| d * d).sum::<f64>() / near.len() as f64).sqrt();
+    println!(
+        "hall: {} of {} vertices near, rms {rms:.3} voxels, {:?} steps",
+        near.len(),
+        mesh.positions.len(),
+        summary.steps
+    );
+    // The noise of one measurement is 0.42 voxel; edges are a voxel wide.
+    assert!(rms < 0.35, "{rms}");
+    // The box around it is not there: the rest is the air.
+    let air = mesh.positions.iter().filter(|p| p.abs().cmplt(DVec3::new(4.6, 2.3, 2.7)).all()).count();
+    assert!(near.len() as f64 > 0.9 * air as f64, "{} of {air}", near.len());
+}
+
 #[test]
 fn one_map_shows_the_front_of_a_ball_and_the_box_closes_the_rest() {
     fn ball(p: DVec3) -> f64 {
