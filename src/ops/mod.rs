@@ -16,6 +16,7 @@ pub mod fillet;
 pub mod morphology;
 mod params;
 mod registry;
+mod rolling;
 pub mod segment;
 mod sequence;
 pub mod shape;
