@@ -401,7 +401,7 @@ struct LeafFelt {
     fastest: f64,
     travel: f64,
     gap: f64,
-    /// Sum over the voxels that are drawn, and their number.
+    /// Sum over the voxels that are drawn, of what they have still to go if they are pushed, and their number.
     distance: f64,
     count: f64,
 }
@@ -480,7 +480,7 @@ impl Drawing<'_> {
             felt.fastest = felt.fastest.max(speed.abs());
             if voxel.share * alpha >= f64::from(DRAWN) {
                 felt.gap = felt.gap.max(voxel.gap);
-                felt.distance += voxel.distance;
+                felt.distance += if self.pull.how.repel { voxel.gap } else { voxel.distance };
                 felt.count += 1.0;
             }
         }
