@@ -51,6 +51,7 @@
 //! | [`pde`] | time stepping: flows, renormalisation, tracking of the band |
 //! | [`mesh`] | triangle meshes: files, to a level set and back, exact rebuilding |
 //! | [`scan`] | scans (NRRD, NIfTI), the surfaces in them, segmentation |
+//! | [`range`] | range maps: what scanners measured along rays |
 //! | `vdb` | OpenVDB files and OpenVDB's own tools as a reference (feature `openvdb`) |
 //! | [`render`] | pictures |
 //! | [`ops`] | the operators and their registry |
@@ -80,6 +81,7 @@ pub mod levelset;
 pub mod mesh;
 pub mod ops;
 pub mod pde;
+pub mod range;
 pub mod recipe;
 pub mod region;
 pub mod render;
