@@ -26,6 +26,7 @@ pub mod smooth;
 pub mod smooth_csg;
 mod solver;
 pub mod sweep;
+pub mod texture;
 pub mod transform;
 pub mod warp;
 

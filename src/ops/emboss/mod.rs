@@ -21,6 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use self::outline::Drawing;
 use self::patch::Patch;
+pub(in crate::ops) use self::patch::Patch as Flat;
 use self::picture::Picture;
 use self::stamp::{Motif, Stamp};
 pub(super) use self::targets::read_polylines;
