@@ -53,6 +53,7 @@
 //! | [`mesh`] | triangle meshes: files, to a level set and back, exact rebuilding |
 //! | [`texture`] | the space above a patch of a surface, and solids wrapped into it |
 //! | [`scan`] | scans (NRRD, NIfTI), the surfaces in them, segmentation |
+//! | [`range`] | range maps: what scanners measured along rays |
 //! | `vdb` | OpenVDB files and OpenVDB's own tools as a reference (feature `openvdb`) |
 //! | [`render`] | pictures |
 //! | [`ops`] | the operators and their registry |
@@ -82,6 +83,7 @@ pub mod levelset;
 pub mod mesh;
 pub mod ops;
 pub mod pde;
+pub mod range;
 pub mod rbf;
 pub mod recipe;
 pub mod region;

@@ -208,7 +208,7 @@ mod tests {
     #[test]
     fn lengths_do_not_matter_in_units() {
         let points = scattered(60);
-        let values: Vec<DVec3> = points.iter().map(|p| p.yzx() * p.x).collect();
+        let values: Vec<DVec3> = points.iter().map(|p| DVec3::new(p.y, p.z, p.x) * p.x).collect();
         let s = Interpolant::new(&points, &values, |_| 0.3, Basis::Linear, 1.0).unwrap();
         for scale in [100.0, 0.01] {
             let far: Vec<DVec3> = points.iter().map(|p| *p * scale + DVec3::new(7.0, -3.0, 40.0)).collect();

@@ -24,6 +24,8 @@ fn needed(entry: &Entry) -> Map<String, Value> {
         // Off the lattice, so that voxels are computed.
         "transform" => json!({ "steps": ["rotate z,30", "translate 0.123,0,0"] }),
         "segment" => json!({ "volume": scan(), "iso": 0.0 }),
+        "reconstruct" => json!({ "scans": scans(), "voxel_size": DX }),
+        "morph" => json!({ "at": 0.5 }),
         "emboss" => json!({ "points": points() }),
         "texture" => json!({ "center": "-1.15,0,0", "radius": 0.3, "height": 0.25 }),
         "warp" => json!({ "handle": ["1.1,0,0:1.11,0.01,0"], "fixed": ["-1,0,0", "0,1,0", "0,0,1"] }),
@@ -72,6 +74,32 @@ fn scan() -> String {
         }
         text
     })
+}
+
+/// Two pictures of a ball, from the left and from the right.
+fn scans() -> String {
+    static FOLDER: OnceLock<tempfile::TempDir> = OnceLock::new();
+    let folder = FOLDER.get_or_init(|| {
+        let folder = tempfile::tempdir().unwrap();
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, 32, 32);
+        encoder.set_color(png::ColorType::Grayscale);
+        encoder.set_depth(png::BitDepth::Sixteen);
+        let depth = |n: i32| {
+            let (x, y) = (f64::from(n % 32) * 0.1 - 1.55, f64::from(n / 32) * 0.1 - 1.55);
+            let squared = 1.0 - x * x - y * y;
+            if squared > 0.0 { ((4.0 - squared.sqrt()) * 1e4) as u16 } else { 0 }
+        };
+        let data: Vec<u8> = (0..1024).flat_map(|n| depth(n).to_be_bytes()).collect();
+        encoder.write_header().unwrap().write_image_data(&data).unwrap();
+        std::fs::write(folder.path().join("a.png"), bytes).unwrap();
+        let text = "version = 1\nscale = 1e-4\nbackground = \"empty\"\northographic = { pitch = [0.1, 0.1], first = [-1.55, -1.55] }\n\
+            [[map]]\nfile = \"a.png\"\npose = [[0,0,1,4],[1,0,0,0],[0,1,0,0],[0,0,0,1]]\n\
+            [[map]]\nfile = \"a.png\"\npose = [[0,0,-1,-4],[-1,0,0,0],[0,1,0,0],[0,0,0,1]]\n";
+        std::fs::write(folder.path().join("set.toml"), text).unwrap();
+        folder
+    });
+    folder.path().join("set.toml").display().to_string()
 }
 
 fn made(distance: impl Fn(DVec3) -> f64 + Sync) -> LevelSet {

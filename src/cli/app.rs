@@ -28,7 +28,9 @@ pub fn command() -> Command {
         .disable_help_subcommand(false)
         .styles(styles);
     let verbs = VERBS.iter().map(|verb| (verb.build)(Command::new(verb.name)));
-    args::running(command).subcommands(verbs).subcommands(REGISTRY.iter().map(operator))
+    // Operators with a verb of their own have no second command.
+    let own = REGISTRY.iter().filter(|entry| VERBS.iter().all(|verb| verb.name != entry.name));
+    args::running(command).subcommands(verbs).subcommands(own.map(operator))
 }
 
 /// The subcommand of an operator.

@@ -22,6 +22,7 @@ const POSITIONALS: &[Positional] = &[
     Positional { operator: "csg", parameter: "operation", value_name: "OP" },
     Positional { operator: "shape", parameter: "spec", value_name: "SPEC" },
     Positional { operator: "segment", parameter: "volume", value_name: "IN" },
+    Positional { operator: "reconstruct", parameter: "scans", value_name: "SCANS" },
 ];
 
 /// `d_min` as `d-min`.

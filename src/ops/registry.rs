@@ -227,6 +227,7 @@ impl Entry {
 pub static REGISTRY: &[Entry] = &[
     Entry::of::<super::shape::Shape>(),
     Entry::of::<super::segment::Segment>(),
+    Entry::of::<super::reconstruct::Reconstruct>(),
     Entry::of::<super::transform::TransformOperator>(),
     Entry::of::<super::csg::Csg>(),
     Entry::of::<super::blend::Blend>(),
@@ -238,6 +239,7 @@ pub static REGISTRY: &[Entry] = &[
     Entry::of::<super::warp::Warp>(),
     Entry::of::<super::sweep::Sweep>(),
     Entry::of::<super::advect::Advect>(),
+    Entry::of::<super::morph::Morph>(),
     Entry::of::<super::morphology::Offset>(),
     Entry::of::<super::morphology::Dilate>(),
     Entry::of::<super::morphology::Erode>(),
