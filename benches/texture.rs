@@ -15,7 +15,7 @@ use vdb_edit::ops::shape::Shape;
 use vdb_edit::ops::{Operator, WorldLength};
 use vdb_edit::rbf::{Basis, Interpolant};
 use vdb_edit::run::RunOptions;
-use vdb_edit::texture::{Laying, Map, Parameterization, Patch, Rbf, Sampling, warped, wrapped};
+use vdb_edit::texture::{Laying, Map, Parameterization, Patch, Rbf, Sampling, Source, warped, wrapped};
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error>>;
 
@@ -56,14 +56,15 @@ fn measure(radius: f64) -> Result<()> {
     let (patch, setup) = timed(|| Patch::between(&ball, corners, 0.5, &Parameterization::Conforming, &run));
     let patch = patch?;
     let laying = Laying { tile: [1, 1], push: 1.0, map: Map::Inverse, sampling: Sampling::Linear };
+    let mut source = Source::new(ring.clone(), &run)?;
     let mesh = level_set_to_mesh(&ring, 0.0, &run)?;
     let bounds = mesh.bounding_box().ok_or("a texture")?;
     let (moved, forwards) = timed(|| warped(&mesh, bounds, &ball, &patch, &laying));
     let speed = moved.positions.len() as f64 / forwards / 1e3;
-    let (inverse, inverse_ms) = timed(|| wrapped(&ball, &ring, &patch, &laying, &run));
+    let (inverse, inverse_ms) = timed(|| wrapped(&ball, &mut source, &patch, &laying, &run));
     let rbf = Rbf { basis: Basis::Linear, lambda: [0.005, 0.3], particles: 400 };
     let with = Laying { map: Map::Implicit(rbf), ..laying };
-    let (implicit, implicit_ms) = timed(|| wrapped(&ball, &ring, &patch, &with, &run));
+    let (implicit, implicit_ms) = timed(|| wrapped(&ball, &mut source, &patch, &with, &run));
     let [near, everywhere] = implicit?.kernels.unwrap_or_default();
     // Any 400 particles cost the same.
     let all = patch.particles().places;

@@ -177,15 +177,20 @@ impl Cells {
         leaves.into_iter().map(IVec3::from_array).collect()
     }
 
-    /// The most that a step of a voxel moves in a texture of the given size: the largest singular value of the inverse, bounded by the norm of its columns.
-    pub fn largest_stretch(&self, size: DVec3) -> f64 {
+    /// How far a step of a voxel moves in a texture of the given size: in the middle cell by its root mean square over directions, and at most, bounded
+    /// by the norm of the inverse's columns.
+    pub fn stretch(&self, size: DVec3) -> [f64; 2] {
         let stretch = |cell: &Cell| {
             let (_, by_t) = cell.at(DVec3::splat(0.5));
             let inverse = DMat3::from_diagonal((cell.high - cell.low) * size) * by_t.inverse();
             let columns = [inverse.x_axis, inverse.y_axis, inverse.z_axis];
             columns.iter().map(|c| c.length_squared()).sum::<f64>().sqrt()
         };
-        self.cells.iter().filter(|cell| cell.holds_texture()).map(stretch).filter(|s| s.is_finite()).fold(0.0, f64::max)
+        let cells = self.cells.iter().filter(|cell| cell.holds_texture());
+        let mut all: Vec<f64> = cells.map(stretch).filter(|s| s.is_finite()).collect();
+        all.sort_unstable_by(f64::total_cmp);
+        let typical = all.get(all.len() / 2).map_or(1.0, |s| s / 3.0f64.sqrt());
+        [typical, all.last().copied().unwrap_or(1.0)]
     }
 
     /// Distortion of the map over target lengths of the whole edges u, v, w, in voxels.

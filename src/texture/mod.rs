@@ -19,7 +19,7 @@ pub use cells::{Distortion, Spread};
 pub use implicit::Rbf;
 pub use patch::Net;
 pub use space::{Parameterization, Particles, Patch};
-pub use wrap::{Laying, Map, Sampling, Wrapped, warped, wrapped};
+pub use wrap::{Laying, Map, Sampling, Source, Wrapped, warped, wrapped};
 
 /// What errors name.
 const OPERATION: &str = "texture";

@@ -4,6 +4,8 @@
 //! the distance: leaves whose middle is far from the texture's surface are left out, and the work grows with that surface, not with the space.
 //! Only the zero set of ψ counts in the end: distances are made exact from it.
 
+use std::collections::BTreeMap;
+
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 
@@ -11,13 +13,13 @@ use super::OPERATION;
 use super::implicit::{Implicit, Rbf};
 use super::space::Patch;
 use crate::error::{EditError, Result};
-use crate::grid::{LEAF_DIM, LeafMask, LeafValues, MAX_COORD, leaf_offset};
+use crate::grid::{LEAF_DIM, LeafMask, LeafValues, MAX_COORD, Transform, leaf_offset};
 use crate::levelset::{BYTES_A_LEAF, LevelSet, Sampler, grid_of_leaves};
 use crate::mesh::{Rebuild, TriangleMesh, level_set_of_mesh, level_set_to_mesh, rebuild, with_half_width};
 use crate::run::RunOptions;
 
-/// Widest band that a texture gets, in voxels.
-const WIDEST: f64 = 24.0;
+/// Half width of the band of a texture that is looked up, in its voxels: it tells blocks of voxels without its surface.
+const BAND: f32 = 12.0;
 
 /// Which map takes places to the texture, or the texture to places.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -61,25 +63,62 @@ pub struct Wrapped {
     pub kernels: Option<[u64; 2]>,
 }
 
+/// A texture that is laid on patches: its polygons, and its distances on lattices as fine as the patches need, made when they are first asked for.
+pub struct Source {
+    mesh: TriangleMesh,
+    bounds: (DVec3, DVec3),
+    given: LevelSet,
+    lattices: BTreeMap<i32, LevelSet>,
+}
+
+impl Source {
+    /// Refuses a texture without a surface.
+    pub fn new(texture: LevelSet, run: &RunOptions) -> Result<Self> {
+        let mesh = level_set_to_mesh(&texture, 0.0, run)?;
+        let Some(bounds) = mesh.bounding_box() else {
+            let accepted =
+                "a solid with a surface: this one is empty; give its mesh finer voxels (`convert --resolution`)";
+            return Err(EditError::parameter(OPERATION, "texture", "an empty level set", accepted));
+        };
+        Ok(Self { mesh, bounds, given: texture, lattices: BTreeMap::new() })
+    }
+
+    /// Lengths of the box around the surface.
+    pub fn size(&self) -> DVec3 {
+        self.bounds.1 - self.bounds.0
+    }
+
+    /// For a map by which a voxel of the base is about `stretch` world units of the texture: voxels of half of that up to all of it, or those that it came
+    /// with, if those are no finer. Finer ones would fall between the voxels of the base.
+    fn lattice(&mut self, stretch: f64, run: &RunOptions) -> Result<LevelSet> {
+        let power = stretch.log2().floor();
+        let key = if power.exp2() > self.given.voxel_size() { power as i32 } else { i32::MIN };
+        if let Some(made) = self.lattices.get(&key) {
+            return Ok(made.clone());
+        }
+        let made = match key {
+            i32::MIN => with_half_width(&self.given, BAND.max(self.given.half_width()), run)?,
+            _ => level_set_of_mesh(self.mesh.clone(), &Transform::uniform(power.exp2()), BAND, run)?,
+        };
+        self.lattices.insert(key, made.clone());
+        Ok(made)
+    }
+}
+
 /// The texture as it lies on the patch of `base`. Its bounding box becomes the patch: x → u, y → v, z → w.
 pub fn wrapped(
     base: &LevelSet,
-    texture: &LevelSet,
+    texture: &mut Source,
     patch: &Patch,
     laying: &Laying,
     run: &RunOptions,
 ) -> Result<Wrapped> {
-    let mesh = level_set_to_mesh(texture, 0.0, run)?;
-    let Some((lo, hi)) = mesh.bounding_box() else {
-        let accepted = "a solid: this one has no surface";
-        return Err(EditError::parameter(OPERATION, "texture", "an empty level set", accepted));
-    };
     if laying.map == Map::SemiImplicit {
-        let moved = warped(&mesh, (lo, hi), base, patch, laying);
+        let moved = warped(&texture.mesh, texture.bounds, base, patch, laying);
         let level_set = level_set_of_mesh(moved, base.transform(), base.half_width(), run)?;
         return Ok(Wrapped { level_set, kernels: None });
     }
-    let solid = Solid::new(texture, (lo, hi), base, patch, laying, run)?;
+    let solid = Solid::new(texture, base, patch, laying, run)?;
     let leaves = patch.cells.leaves();
     let advice = "take a smaller patch or height, or larger voxels";
     run.reserve(OPERATION, leaves.len() as u64 * BYTES_A_LEAF, advice)?;
@@ -156,28 +195,18 @@ pub(super) struct Solid<'a> {
 pub(super) struct Probe<'a>(Sampler<'a>, Sampler<'a>);
 
 impl<'a> Solid<'a> {
-    fn new(
-        texture: &LevelSet,
-        (lo, hi): (DVec3, DVec3),
-        base: &'a LevelSet,
-        patch: &Patch,
-        laying: &Laying,
-        run: &RunOptions,
-    ) -> Result<Self> {
-        let size = hi - lo;
+    fn new(texture: &mut Source, base: &'a LevelSet, patch: &Patch, laying: &Laying, run: &RunOptions) -> Result<Self> {
+        let (lo, size) = (texture.bounds.0, texture.size());
         let tile = laying.tile.map(|n| f64::from(n.max(1)));
-        let stretch = patch.cells.largest_stretch(size * DVec3::new(tile[0], tile[1], 1.0));
-        // A band that tells whole leaves without the texture's surface.
-        let band = (radius(LEAF_DIM) + f64::from(base.half_width())) * stretch / texture.voxel_size();
-        let has = f64::from(texture.half_width());
-        let texture = with_half_width(texture, band.clamp(has, has.max(WIDEST)) as f32, run)?;
+        let [typical, stretch] = patch.cells.stretch(size * DVec3::new(tile[0], tile[1], 1.0));
+        let texture = texture.lattice(typical, run)?;
         let height = patch.lengths().z;
         Ok(Self {
             lo,
             size,
             tile,
             push: laying.push / height,
-            rim: (1.5 * texture.voxel_size() / size).min(DVec3::splat(0.5)),
+            rim: (RIM * typical / size).min(DVec3::splat(0.5)),
             raised: patch.raised,
             height,
             depth: patch.depth - 1.5,
@@ -228,7 +257,7 @@ impl<'a> Solid<'a> {
         }
         let behind = if self.raised { -uvw.z * self.height } else { (uvw.z - 1.0) * self.height };
         let phi = phi.max(behind - self.depth);
-        if self.raised && uvw.z < 0.0 {
+        if self.raised && behind > SKIN {
             // Not out of the other side of a thin wall.
             return phi.max(f64::from(probe.1.trilinear(ijk)) / self.base.voxel_size());
         }
@@ -257,6 +286,12 @@ pub(super) fn catmull_rom(t: f64) -> [f64; 4] {
         0.5 * (cube - square),
     ]
 }
+
+/// How far the surface may lie below the particles' net, in voxels: as far a texture goes on behind it in any case.
+const SKIN: f64 = 1.5;
+
+/// How far inside of a face that goes on the texture is looked up, in voxels of the base: nearer, its distance would be lost between them.
+const RIM: f64 = 1.5;
 
 /// φ between voxels by Catmull and Rom's splines along each axis.
 fn cubic(sampler: &mut Sampler, ijk: DVec3) -> f64 {

@@ -35,7 +35,7 @@ use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::rbf::Basis;
 use crate::run::RunOptions;
-use crate::texture::{Distortion, Laying, Map, Parameterization, Particles, Patch, Rbf, Sampling, wrapped};
+use crate::texture::{Distortion, Laying, Map, Parameterization, Particles, Patch, Rbf, Sampling, Source, wrapped};
 
 words! {
     /// How the space above a patch is divided.
@@ -318,7 +318,7 @@ impl Operator for Texture {
             summary.warnings.push("the base has no surface: nothing was changed".into());
             return Ok(Outcome { level_set: base, summary });
         }
-        let laid = self.laid(&base, &texture, &mut summary, run)?;
+        let laid = self.laid(&base, texture, &mut summary, run)?;
         let [first, others @ ..] = &laid[..] else {
             summary.warnings.push("there is no patch: nothing was changed".into());
             return Ok(Outcome { level_set: base, summary });
@@ -353,16 +353,12 @@ impl Texture {
     fn laid(
         &self,
         base: &LevelSet,
-        texture: &LevelSet,
+        texture: LevelSet,
         summary: &mut Summary,
         run: &RunOptions,
     ) -> Result<Vec<LevelSet>> {
-        let Some((lo, hi)) = texture.world_bounds() else {
-            let accepted =
-                "a solid with a surface: this one is empty; give its mesh finer voxels (`convert --resolution`)";
-            return Err(EditError::parameter(Self::NAME, "texture", "an empty level set", accepted));
-        };
-        let shape = (hi - lo) - 2.0 * f64::from(texture.background());
+        let mut source = Source::new(texture, run)?;
+        let shape = source.size();
         let places = self.places(base, run)?;
         let most = places.scattered.unwrap_or(places.list.len()).min(places.list.len());
         let (mut left_out, mut refused) = (0, None);
@@ -402,7 +398,7 @@ impl Texture {
                 particles.places.extend(more.places.iter().map(world));
                 particles.edges.extend(more.edges.iter().map(|e| e.map(|v| v + first)));
             }
-            let wrapped = wrapped(&part, texture, &patch, &laying, run)?;
+            let wrapped = wrapped(&part, &mut source, &patch, &laying, run)?;
             report.kernels = report.kernels.zip(wrapped.kernels).map(|(a, b)| [a[0] + b[0], a[1] + b[1]]);
             laid.push(wrapped.level_set);
             task.advance(1);
