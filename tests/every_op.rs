@@ -24,7 +24,10 @@ fn needed(entry: &Entry) -> Map<String, Value> {
         // Off the lattice, so that voxels are computed.
         "transform" => json!({ "steps": ["rotate z,30", "translate 0.123,0,0"] }),
         "segment" => json!({ "volume": scan(), "iso": 0.0 }),
+        "reconstruct" => json!({ "scans": scans(), "voxel_size": DX }),
+        "morph" => json!({ "at": 0.5 }),
         "emboss" => json!({ "points": points() }),
+        "texture" => json!({ "center": "-1.15,0,0", "radius": 0.3, "height": 0.25 }),
         "warp" => json!({ "handle": ["1.1,0,0:1.11,0.01,0"], "fixed": ["-1,0,0", "0,1,0", "0,0,1"] }),
         "sweep" => json!({ "through": ["0,0,0", "0.2,0.1,0"] }),
         "advect" => json!({ "velocity": velocity(), "time": 0.004 }),
@@ -73,6 +76,32 @@ fn scan() -> String {
     })
 }
 
+/// Two pictures of a ball, from the left and from the right.
+fn scans() -> String {
+    static FOLDER: OnceLock<tempfile::TempDir> = OnceLock::new();
+    let folder = FOLDER.get_or_init(|| {
+        let folder = tempfile::tempdir().unwrap();
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, 32, 32);
+        encoder.set_color(png::ColorType::Grayscale);
+        encoder.set_depth(png::BitDepth::Sixteen);
+        let depth = |n: i32| {
+            let (x, y) = (f64::from(n % 32) * 0.1 - 1.55, f64::from(n / 32) * 0.1 - 1.55);
+            let squared = 1.0 - x * x - y * y;
+            if squared > 0.0 { ((4.0 - squared.sqrt()) * 1e4) as u16 } else { 0 }
+        };
+        let data: Vec<u8> = (0..1024).flat_map(|n| depth(n).to_be_bytes()).collect();
+        encoder.write_header().unwrap().write_image_data(&data).unwrap();
+        std::fs::write(folder.path().join("a.png"), bytes).unwrap();
+        let text = "version = 1\nscale = 1e-4\nbackground = \"empty\"\northographic = { pitch = [0.1, 0.1], first = [-1.55, -1.55] }\n\
+            [[map]]\nfile = \"a.png\"\npose = [[0,0,1,4],[1,0,0,0],[0,1,0,0],[0,0,0,1]]\n\
+            [[map]]\nfile = \"a.png\"\npose = [[0,0,-1,-4],[-1,0,0,0],[0,1,0,0],[0,0,0,1]]\n";
+        std::fs::write(folder.path().join("set.toml"), text).unwrap();
+        folder
+    });
+    folder.path().join("set.toml").display().to_string()
+}
+
 fn made(distance: impl Fn(DVec3) -> f64 + Sync) -> LevelSet {
     let (transform, bounds) = (Transform::uniform(DX), (IVec3::splat(-24), IVec3::splat(24)));
     LevelSet::from_distance(transform, 3.0, bounds, |ijk| distance(ijk * DX) / DX, &RunOptions::default()).unwrap()
@@ -96,7 +125,7 @@ fn inputs(entry: &Entry, subject: &LevelSet) -> Vec<LevelSet> {
     match entry.arity {
         Arity::Source => vec![],
         Arity::One => vec![subject.clone()],
-        Arity::Many => vec![subject.clone(), other()],
+        Arity::Many | Arity::BaseAndSolid => vec![subject.clone(), other()],
     }
 }
 
@@ -236,6 +265,7 @@ fn the_number_of_inputs_is_checked() {
             Arity::Source => &[1, 2],
             Arity::One => &[0, 2],
             Arity::Many => &[0, 1],
+            Arity::BaseAndSolid => &[0, 1, 3],
         };
         for &count in wrong {
             let result = entry.run(needed(entry), vec![subject.clone(); count], &RunOptions::default());
@@ -264,7 +294,7 @@ fn results_are_valid_level_sets_and_inputs_stay_as_they_were() {
 fn nothing_in_gives_nothing_out() {
     let nothing = LevelSet::empty(Transform::uniform(DX), 3.0);
     for entry in operators().filter(|entry| entry.arity != Arity::Source) {
-        let count = if entry.arity == Arity::Many { 2 } else { 1 };
+        let count = if entry.arity == Arity::One { 1 } else { 2 };
         let outcome = entry.run(needed(entry), vec![nothing.clone(); count], &RunOptions::default());
         let result = outcome.unwrap_or_else(|e| panic!("{}: {e}", entry.name)).level_set;
         assert!(result.is_empty() && result.check().is_empty(), "{}", entry.name);

@@ -28,7 +28,9 @@ pub fn command() -> Command {
         .disable_help_subcommand(false)
         .styles(styles);
     let verbs = VERBS.iter().map(|verb| (verb.build)(Command::new(verb.name)));
-    args::running(command).subcommands(verbs).subcommands(REGISTRY.iter().map(operator))
+    // Operators with a verb of their own have no second command.
+    let own = REGISTRY.iter().filter(|entry| VERBS.iter().all(|verb| verb.name != entry.name));
+    args::running(command).subcommands(verbs).subcommands(own.map(operator))
 }
 
 /// The subcommand of an operator.
@@ -46,10 +48,14 @@ fn operator(entry: &Entry) -> Command {
         Arity::Many => {
             command.arg(inputs.value_name("IN").num_args(2..).help("Two or more: each a .vdb, a mesh, or `-`"))
         }
+        Arity::BaseAndSolid => {
+            let help = "The base, then the texture: each a .vdb, a mesh, or `-`; a mesh as texture gets 256 voxels along its longest axis";
+            command.arg(inputs.value_names(["BASE", "TEXTURE"]).num_args(2).help(help))
+        }
     };
     let command = match entry.arity {
         Arity::Source => command,
-        Arity::One | Arity::Many => args::conversion(args::grids(command), own),
+        Arity::One | Arity::Many | Arity::BaseAndSolid => args::conversion(args::grids(command), own),
     };
     args::output(command)
 }

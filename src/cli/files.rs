@@ -42,12 +42,6 @@ pub fn output(matches: &ArgMatches, context: &Context) -> Result<Output> {
         let accepted = "a file: standard output takes either the .vdb or the --json result";
         return Err(EditError::parameter("vdb-edit", "output", "-", accepted));
     }
-    let word = |id: &str| matches.get_one::<String>(id).cloned();
-    let volume = VolumeOptions {
-        half: word("precision").map(|word| word == "half"),
-        compression: word("compression"),
-        only_result: args::flag(matches, "only-result"),
-    };
     let number = |id: &str| matches.try_get_one::<f64>(id).ok().flatten().copied();
     let mesh = MeshParams {
         simplify: number("simplify"),
@@ -55,5 +49,15 @@ pub fn output(matches: &ArgMatches, context: &Context) -> Result<Output> {
         quads: args::flag(matches, "quads"),
         attributes_from: args::paths(matches, "attributes-from").pop(),
     };
-    Output::plan(path, volume, &mesh)
+    Output::plan(path, volume_options(matches), &mesh)
+}
+
+/// How a `.vdb` is to be written.
+pub fn volume_options(matches: &ArgMatches) -> VolumeOptions {
+    let word = |id: &str| matches.get_one::<String>(id).cloned();
+    VolumeOptions {
+        half: word("precision").map(|word| word == "half"),
+        compression: word("compression"),
+        only_result: args::flag(matches, "only-result"),
+    }
 }

@@ -16,6 +16,7 @@ mod edit;
 mod files;
 mod geodesic;
 mod info;
+mod morph;
 mod options;
 mod preview;
 mod progress;
@@ -49,6 +50,7 @@ const VERBS: &[Verb] = &[
     convert::VERB,
     compare::VERB,
     geodesic::VERB,
+    morph::VERB,
     render::VERB,
     #[cfg(feature = "openvdb")]
     crosscheck::VERB,

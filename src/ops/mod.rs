@@ -13,8 +13,10 @@ mod curvature;
 pub mod distance;
 pub mod emboss;
 pub mod fillet;
+pub mod morph;
 pub mod morphology;
 mod params;
+pub mod reconstruct;
 mod registry;
 mod rolling;
 pub mod segment;
@@ -25,6 +27,7 @@ pub mod smooth;
 pub mod smooth_csg;
 mod solver;
 pub mod sweep;
+pub mod texture;
 pub mod transform;
 pub mod warp;
 

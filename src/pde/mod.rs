@@ -18,15 +18,14 @@ mod rest;
 mod sharpen;
 mod speed;
 mod step;
+mod surface_speed;
 mod threshold;
 mod track;
 mod tracker;
 
 pub use advect::{VelocityField, advect};
 pub use anisotropic::{AnisotropicGaussian, filter_anisotropic};
-pub use attract::{
-    Attraction, AttractionReport, Attractor, IndexBounds, REACHED, attract, drawn_within, leaves_around,
-};
+pub use attract::{Attraction, AttractionReport, Attractor, IndexBounds, Pull, REACHED, attract, leaves_around};
 pub use curvature_flow::{CurvatureFlow, FlowCurvature};
 pub use evolve::{Report, StopReason, Until, evolve};
 pub use filter::{Filter, FilterKind, filter, offset};
@@ -35,6 +34,7 @@ pub use morph::{MorphOptions, MorphSpeed, morph_towards};
 pub use renormalize::renormalize;
 pub use sharpen::sharpen;
 pub use speed::SpeedFunction;
+pub use surface_speed::{Foot, LeafSurface, Moment, SurfaceSpeed, Tally, move_surface};
 pub use threshold::grow_by_threshold;
 pub use track::track;
 pub use tracker::Tracker;

@@ -52,6 +52,29 @@ impl Image {
         writer.finish()?;
         Ok(())
     }
+
+    /// Writes pictures of one size as an animated PNG that goes on for ever; viewers without animation show the first.
+    pub fn write_animation(images: &[Self], frames_a_second: u16, to: impl Write) -> io::Result<()> {
+        let Some(first) = images.first() else { return Err(io::Error::other("an animation without pictures")) };
+        if images.iter().any(|image| (image.width, image.height) != (first.width, first.height)) {
+            return Err(io::Error::other("the pictures of an animation have one size"));
+        }
+        let mut encoder = png::Encoder::new(to, first.width, first.height);
+        encoder.set_depth(png::BitDepth::Eight);
+        encoder.set_color(png::ColorType::Rgba);
+        encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
+        let count = u32::try_from(images.len()).map_err(io::Error::other)?;
+        if count > 1 {
+            encoder.set_animated(count, 0)?;
+            encoder.set_frame_delay(1, frames_a_second)?;
+        }
+        let mut writer = encoder.write_header()?;
+        for image in images {
+            writer.write_image_data(&image.rgba8)?;
+        }
+        writer.finish()?;
+        Ok(())
+    }
 }
 
 #[cfg(test)]

@@ -31,13 +31,18 @@ const LEAST_AHEAD: f64 = 1e-6;
 /// Rounds of averaging of coordinates.
 const ROUNDS: usize = 30;
 
+/// How far from a triangle in the plane, in voxels, a place counts as in it.
+const INSIDE: f64 = 1e-4;
+
 /// Part of a patch's radius over which its normals are averaged, and most rounds of averaging: a round spreads over an edge, n over √n of them.
 const AVERAGED: f64 = 0.15;
 const MOST_ROUNDS: f64 = 200.0;
 
 /// A patch of a surface with flat coordinates, all in index space.
-pub(super) struct Patch {
+pub(in crate::ops) struct Patch {
     tree: Bvh,
+    /// Of the triangles as they lie in the plane.
+    flat: Bvh,
     triangles: Vec<[u32; 3]>,
     positions: Vec<DVec3>,
     normals: Vec<DVec3>,
@@ -48,7 +53,7 @@ pub(super) struct Patch {
 
 /// Where a point lies over a patch.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Place {
+pub(in crate::ops) struct Place {
     /// Flat coordinates of the patch's closest point.
     pub flat: DVec2,
     /// Distance from it, negative below the surface.
@@ -127,7 +132,8 @@ impl Patch {
         let triangles: Vec<[u32; 3]> = triangles.into_iter().filter(known).collect();
         let coordinates: Vec<DVec2> = coordinates.into_iter().map(Option::unwrap_or_default).collect();
         let tree = Bvh::new(triangles.iter().map(|t| t.map(|v| local[v as usize])).collect());
-        Ok(Self { tree, triangles, positions: local, normals, coordinates, centre })
+        let flat = Bvh::new(triangles.iter().map(|t| t.map(|v| coordinates[v as usize].extend(0.0))).collect());
+        Ok(Self { tree, flat, triangles, positions: local, normals, coordinates, centre })
     }
 
     /// Where `ijk` lies over the patch.
@@ -148,17 +154,11 @@ impl Patch {
 
     /// The surface point with given flat coordinates and its normal: that of the triangle that holds them.
     pub fn lift(&self, flat: DVec2) -> Option<(DVec3, DVec3)> {
-        let found = self.triangles.iter().find_map(|t| {
-            let t = t.map(|v| v as usize);
-            let [a, b, c] = t.map(|v| self.coordinates[v]);
-            let area = (b - a).perp_dot(c - a);
-            let (u, v) = ((flat - a).perp_dot(c - a) / area, (b - a).perp_dot(flat - a) / area);
-            (area > 0.0 && u >= 0.0 && v >= 0.0 && u + v <= 1.0).then_some((t, [1.0 - u - v, u, v]))
-        });
-        found.map(|(t, weights)| {
-            let sum = |of: &[DVec3]| t.iter().zip(weights).map(|(&v, w)| of[v] * w).sum::<DVec3>();
-            (sum(&self.positions), sum(&self.normals).normalize_or_zero())
-        })
+        let hit = self.flat.closest_point(flat.extend(0.0), INSIDE)?;
+        let t = self.triangles[hit.triangle as usize].map(|v| v as usize);
+        let weights = barycentric(hit.point, t.map(|v| self.coordinates[v].extend(0.0)));
+        let sum = |of: &[DVec3]| t.iter().zip(weights).map(|(&v, w)| of[v] * w).sum::<DVec3>();
+        Some((sum(&self.positions), sum(&self.normals).normalize_or_zero()))
     }
 
     /// Of the triangles that `wanted` picks by their middle, the part (0..1, by area) that lies upside down in the plane.

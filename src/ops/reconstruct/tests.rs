@@ -1,0 +1,274 @@
+use glam::{DAffine3, DMat3, DVec2};
+
+use super::*;
+use crate::range::{Background, Projection};
+
+const MAJOR: f64 = 1.0 / 0.0425;
+const MINOR: f64 = 0.4 / 0.0425;
+
+fn torus(p: DVec3) -> f64 {
+    (p.x.hypot(p.y) - MAJOR).hypot(p.z) - MINOR
+}
+
+/// Standard normal numbers that are the same everywhere.
+struct Noise(u64);
+
+impl Noise {
+    fn uniform(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut h = self.0;
+        for factor in [0xbf58_476d_1ce4_e5b9, 0x94d0_49bb_1331_11eb] {
+            h = (h ^ h >> 30).wrapping_mul(factor);
+        }
+        ((h ^ h >> 31) >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    fn normal(&mut self) -> f64 {
+        let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
+        radius * (std::f64::consts::TAU * self.uniform()).cos()
+    }
+}
+
+/// Six maps along the axes of something given by its distance function.
+fn six_maps(solid: fn(DVec3) -> f64, noise: f64, perspective: bool) -> RangeSet {
+    const PIXELS: usize = 200;
+    const FAR: f64 = 5.0 / 0.0425;
+    let half = 1.6 / 0.0425;
+    let mut random = Noise(1);
+    let views = [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z];
+    let maps = views.iter().enumerate().map(|(n, view)| {
+        let side = if view.z.abs() > 0.5 { DVec3::X } else { DVec3::Z.cross(*view) };
+        let up = view.cross(side);
+        let (projection, axes) = if perspective {
+            let focal = (PIXELS as f64 - 1.0) / 2.0 / 20f64.to_radians().tan();
+            let centre = DVec2::splat((PIXELS as f64 - 1.0) / 2.0);
+            // The camera looks along its z.
+            (Projection::Pinhole { focal: DVec2::splat(focal), centre }, DMat3::from_cols(side, -up, -*view))
+        } else {
+            let pitch = 2.0 * half / (PIXELS as f64 - 1.0);
+            let first = DVec2::splat(-half);
+            (Projection::Orthographic { first, pitch: DVec2::splat(pitch) }, DMat3::from_cols(side, up, *view))
+        };
+        let pose = DAffine3 { matrix3: axes, translation: *view * FAR };
+        let mut ranges = Vec::new();
+        for v in 0..PIXELS {
+            for u in 0..PIXELS {
+                let at = |t: f64| pose.transform_point3(projection.point(DVec2::new(u as f64, v as f64), t));
+                let mut t = 0.0;
+                for _ in 0..200 {
+                    t += solid(at(t));
+                }
+                let hit = solid(at(t)).abs() < 1e-3 && t < 2.0 * FAR;
+                ranges.push(if hit { (t + noise * random.normal()) as f32 } else { f32::NAN });
+            }
+        }
+        RangeMap {
+            name: format!("view {n}"),
+            projection,
+            pose,
+            width: PIXELS,
+            height: PIXELS,
+            weights: vec![1.0; ranges.len()],
+            ranges,
+            noise: (noise > 0.0).then_some(noise),
+            background: Background::Empty,
+        }
+    });
+    RangeSet { maps: maps.collect(), ..RangeSet::default() }
+}
+
+fn made(set: RangeSet, params: &Reconstruct) -> (LevelSet, Summary) {
+    let Outcome { level_set, summary } = reconstruct(set, params, &RunOptions::default()).unwrap();
+    assert_eq!(level_set.check(), []);
+    (level_set, summary)
+}
+
+fn voxels() -> Reconstruct {
+    Reconstruct { voxel_size: Some(WorldLength::new(1.0)), ..Reconstruct::default() }
+}
+
+/// RMS and mean of the distance of the zero set from a surface.
+fn error(level_set: &LevelSet, exact: fn(DVec3) -> f64) -> (f64, f64) {
+    let mesh = level_set_to_mesh(level_set, 0.0, &RunOptions::default()).unwrap();
+    let distances: Vec<f64> = mesh.positions.iter().map(|p| exact(*p)).collect();
+    let count = distances.len() as f64;
+    ((distances.iter().map(|d| d * d).sum::<f64>() / count).sqrt(), distances.iter().sum::<f64>() / count)
+}
+
+#[test]
+fn a_torus_from_six_noisy_maps() {
+    let truth = 2.0 * std::f64::consts::PI.powi(2) * MAJOR * MINOR * MINOR;
+    for (perspective, low_pass, limit) in [(false, 0.5, 0.25), (true, 0.5, 0.25), (false, 0.0, 0.35)] {
+        let params = Reconstruct { low_pass: VoxelLength::new(low_pass), ..voxels() };
+        let (level_set, summary) = made(six_maps(torus, 0.2 * MINOR, perspective), &params);
+        let (rms, mean) = error(&level_set, torus);
+        let measures = level_set.measure(&RunOptions::default()).unwrap();
+        println!(
+            "torus: perspective {perspective} low pass {low_pass}: rms {rms:.3} mean {mean:+.3} volume {:.4} components {} euler {} {:?} {:?}",
+            measures.volume / truth,
+            measures.components,
+            measures.euler,
+            summary.steps,
+            summary.stopped_because
+        );
+        assert!(rms < limit, "{rms}");
+        assert!((measures.volume / truth - 1.0).abs() < 0.02, "{}", measures.volume / truth);
+        assert!(measures.components == 1 && measures.euler == 0, "{measures:?}");
+        // The noise that is estimated from the maps is that which was put in.
+        for map in summary.details["maps"].as_array().unwrap() {
+            let noise = map["estimated_noise"].as_f64().unwrap();
+            assert!(low_pass == 0.0 || (noise / (0.2 * MINOR) - 1.0).abs() < 0.1, "{map}");
+        }
+    }
+}
+
+#[test]
+fn without_noise_and_prior_the_torus_is_met() {
+    let params = Reconstruct { beta: 0.0, ..voxels() };
+    let (level_set, _) = made(six_maps(torus, 0.0, false), &params);
+    let (rms, mean) = error(&level_set, torus);
+    println!("no noise: rms {rms:.3} mean {mean:+.3}");
+    assert!(rms < 0.1, "{rms}");
+}
+
+/// A hall of 9 x 4.4 x 5.2 with a table, a column and a ball; positive in the air.
+fn hall(p: DVec3) -> f64 {
+    let cuboid = |centre: DVec3, half: DVec3| {
+        let q = (p - centre).abs() - half;
+        q.max(DVec3::ZERO).length() + q.max_element().min(0.0)
+    };
+    let walls = -cuboid(DVec3::ZERO, DVec3::new(4.5, 2.2, 2.6));
+    let table = cuboid(DVec3::new(1.5, -1.2, 0.3), DVec3::new(0.9, 1.0, 0.6));
+    let column = p.truncate().distance(DVec2::new(-1.8, 0.3)) - 0.4;
+    let ball = p.distance(DVec3::new(-3.2, -1.4, 1.4)) - 0.7;
+    walls.min(table).min(column).min(ball)
+}
+
+#[test]
+fn a_hall_seen_by_twelve_turning_scanners() {
+    let (columns, rows, noise) = (160, 70, 0.05);
+    let mut random = Noise(7);
+    let mut maps = Vec::new();
+    for n in 0..12 {
+        let place =
+            DVec3::new(f64::from(n % 4) * 2.3 - 3.5, [1.2, -0.3, 1.6][n as usize / 4], f64::from(n % 3) * 0.9 - 1.0);
+        if hall(place) < 0.3 {
+            continue;
+        }
+        let step = DVec2::new(std::f64::consts::TAU / f64::from(columns), 2.8 / f64::from(rows));
+        let projection = Projection::Spherical { first: DVec2::new(-3.0, -1.4), step };
+        let pose = DAffine3::from_rotation_translation(glam::DQuat::from_rotation_z(f64::from(n)), place);
+        let mut ranges = Vec::new();
+        for v in 0..rows {
+            for u in 0..columns {
+                let direction = projection.point(DVec2::new(f64::from(u), f64::from(v)), 1.0);
+                let direction = pose.transform_vector3(direction);
+                let mut t = 0.0;
+                for _ in 0..100 {
+                    t += hall(place + direction * t);
+                }
+                ranges.push((t + noise * random.normal()) as f32);
+            }
+        }
+        maps.push(RangeMap {
+            name: format!("scanner {n}"),
+            projection,
+            pose,
+            width: columns as usize,
+            height: rows as usize,
+            weights: vec![1.0; ranges.len()],
+            ranges,
+            noise: Some(noise),
+            background: Background::Unknown,
+        });
+    }
+    let params =
+        Reconstruct { voxel_size: Some(WorldLength::new(0.12)), iterations: 32, beta: 0.5, ..Reconstruct::default() };
+    let (level_set, summary) = made(RangeSet { maps, ..RangeSet::default() }, &params);
+    let mesh = level_set_to_mesh(&level_set, 0.0, &RunOptions::default()).unwrap();
+    let near: Vec<f64> = mesh.positions.iter().map(|p| hall(*p) / 0.12).filter(|d| d.abs() < 2.0).collect();
+    let rms = (near.iter().map(|d| d * d).sum::<f64>() / near.len() as f64).sqrt();
+    println!(
+        "hall: {} of {} vertices near, rms {rms:.3} voxels, {:?} steps",
+        near.len(),
+        mesh.positions.len(),
+        summary.steps
+    );
+    // The noise of one measurement is 0.42 voxel; edges are a voxel wide.
+    assert!(rms < 0.35, "{rms}");
+    // The box around it is not there: the rest is the air.
+    let air = mesh.positions.iter().filter(|p| p.abs().cmplt(DVec3::new(4.6, 2.3, 2.7)).all()).count();
+    assert!(near.len() as f64 > 0.9 * air as f64, "{} of {air}", near.len());
+}
+
+#[test]
+fn one_map_shows_the_front_of_a_ball_and_the_box_closes_the_rest() {
+    fn ball(p: DVec3) -> f64 {
+        p.length() - 20.0
+    }
+    let mut set = six_maps(ball, 0.0, false);
+    set.maps = vec![set.maps.remove(4)];
+    let params = Reconstruct { beta: 0.5, ..voxels() };
+    let (level_set, summary) = made(set, &params);
+    let mesh = level_set_to_mesh(&level_set, 0.0, &RunOptions::default()).unwrap();
+    let front: Vec<f64> = mesh.positions.iter().filter(|p| p.z > 12.0).map(|p| ball(*p)).collect();
+    let rms = (front.iter().map(|d| d * d).sum::<f64>() / front.len() as f64).sqrt();
+    println!("one map: rms of the front {rms:.3}, unseen {:?}", summary.details["unseen_part"]);
+    assert!(front.len() > 300 && rms < 0.1, "{rms}");
+    assert_eq!(level_set.measure(&RunOptions::default()).unwrap().components, 1);
+    assert!(summary.details["unseen_part"].as_f64().unwrap() > 0.2);
+}
+
+#[test]
+fn poses_are_refined() {
+    let mut set = six_maps(torus, 0.0, false);
+    for (n, map) in set.maps.iter_mut().enumerate().skip(1) {
+        let shift = DVec3::new(1.0, -0.8, 0.6) * if n % 2 == 0 { 1.0 } else { -1.0 };
+        map.pose.translation += shift;
+    }
+    let params = voxels();
+    // Of a torus that is moved as a whole nothing can be said: it is the maps that are to agree.
+    let disagreement = |params: &Reconstruct| {
+        let (_, summary) = made(set.clone(), params);
+        let maps = summary.details["maps"].as_array().unwrap();
+        maps.iter().map(|map| map["residual_rms"].as_f64().unwrap()).sum::<f64>() / 6.0
+    };
+    let (before, after) = (disagreement(&params), disagreement(&Reconstruct { refine: 2, ..params.clone() }));
+    println!("poses: {before:.3} to {after:.3}");
+    assert!(after < 0.6 * before, "{before} {after}");
+}
+
+#[test]
+fn refusals() {
+    let refused = |params: Reconstruct| params.validate().err().unwrap();
+    assert_eq!(refused(Reconstruct::default()).exit_code(), 3);
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path.display().to_string()
+    };
+    let conf = file("a.conf", "bmesh missing.ply 0 0 0 0 0 0 1\n");
+    for (params, word) in [
+        (Reconstruct { resolution: 2.0, ..Reconstruct::default() }, "resolution"),
+        (Reconstruct { beta: -1.0, ..Reconstruct::default() }, "beta"),
+        (Reconstruct { low_pass: VoxelLength::new(f64::NAN), ..Reconstruct::default() }, "low_pass"),
+        (Reconstruct { least_part: 1.0, ..Reconstruct::default() }, "least_part"),
+        (Reconstruct { noise: Some(WorldLength::new(-1.0)), ..Reconstruct::default() }, "noise"),
+    ] {
+        let error = refused(Reconstruct { scans: conf.clone(), ..params });
+        assert!(error.exit_code() == 2 && error.to_string().contains(word), "{error}");
+    }
+    let run = RunOptions::default();
+    let error = |scans: &str, skip_missing: bool| {
+        let params = Reconstruct { scans: scans.into(), skip_missing, ..Reconstruct::default() };
+        params.apply(Vec::new(), &run).err().unwrap()
+    };
+    let said = error(&conf, false).to_string();
+    assert!(said.contains("missing.ply") && said.contains("skip_missing"), "{said}");
+    assert!(error(&conf, true).to_string().contains("holds no range map"));
+    // All ranges are no numbers.
+    let mut set = six_maps(torus, 0.0, false);
+    set.maps.iter_mut().for_each(|map| map.ranges.iter_mut().for_each(|r| *r = f32::INFINITY));
+    assert_eq!(reconstruct(set, &voxels(), &run).err().unwrap().exit_code(), 2);
+}
