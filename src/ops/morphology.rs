@@ -414,7 +414,6 @@ mod tests {
             let beside: Vec<_> = once.band_voxels().into_iter().filter(|(_, value)| value.abs() < 0.5).collect();
             let difference = |(ijk, value): &(IVec3, f32)| f64::from(again.voxel(*ijk) - value).abs() / 0.5;
             let most = beside.iter().map(difference).fold(0.0, f64::max);
-            eprintln!("IDEMPOTENT {open} {most}");
             assert!(most < if open { 0.6 } else { 0.1 }, "{open}: {most}");
         }
     }
