@@ -44,12 +44,14 @@
 //! |---|---|
 //! | [`error`], [`run`] | what can go wrong; cancellation, progress and the memory limit |
 //! | [`atomic`], [`spec`] | files that appear whole or not at all; the one-line grammar of shapes and regions |
+//! | [`rbf`] | interpolation by radial basis functions |
 //! | [`grid`] | sparse storage: leaves of 8³ voxels, their active masks, the sign everywhere else |
 //! | [`stencil`] | finite differences: gathering, curvature, upwind gradients, instruction sets |
 //! | [`levelset`] | [`LevelSet`]: band, invariants, measures, sampling, analytic solids |
 //! | [`region`] | where an operator acts, and how strongly |
 //! | [`pde`] | time stepping: flows, renormalisation, tracking of the band |
 //! | [`mesh`] | triangle meshes: files, to a level set and back, exact rebuilding |
+//! | [`texture`] | the space above a patch of a surface, and solids wrapped into it |
 //! | [`scan`] | scans (NRRD, NIfTI), the surfaces in them, segmentation |
 //! | [`range`] | range maps: what scanners measured along rays |
 //! | `vdb` | OpenVDB files and OpenVDB's own tools as a reference (feature `openvdb`) |
@@ -82,6 +84,7 @@ pub mod mesh;
 pub mod ops;
 pub mod pde;
 pub mod range;
+pub mod rbf;
 pub mod recipe;
 pub mod region;
 pub mod render;
@@ -89,6 +92,7 @@ pub mod run;
 pub mod scan;
 pub mod spec;
 pub mod stencil;
+pub mod texture;
 #[cfg(feature = "openvdb")]
 pub mod vdb;
 

@@ -27,6 +27,7 @@ fn needed(entry: &Entry) -> Map<String, Value> {
         "reconstruct" => json!({ "scans": scans(), "voxel_size": DX }),
         "morph" => json!({ "at": 0.5 }),
         "emboss" => json!({ "points": points() }),
+        "texture" => json!({ "center": "-1.15,0,0", "radius": 0.3, "height": 0.25 }),
         "warp" => json!({ "handle": ["1.1,0,0:1.11,0.01,0"], "fixed": ["-1,0,0", "0,1,0", "0,0,1"] }),
         "sweep" => json!({ "through": ["0,0,0", "0.2,0.1,0"] }),
         "advect" => json!({ "velocity": velocity(), "time": 0.004 }),
@@ -124,7 +125,7 @@ fn inputs(entry: &Entry, subject: &LevelSet) -> Vec<LevelSet> {
     match entry.arity {
         Arity::Source => vec![],
         Arity::One => vec![subject.clone()],
-        Arity::Many => vec![subject.clone(), other()],
+        Arity::Many | Arity::BaseAndSolid => vec![subject.clone(), other()],
     }
 }
 
@@ -264,6 +265,7 @@ fn the_number_of_inputs_is_checked() {
             Arity::Source => &[1, 2],
             Arity::One => &[0, 2],
             Arity::Many => &[0, 1],
+            Arity::BaseAndSolid => &[0, 1, 3],
         };
         for &count in wrong {
             let result = entry.run(needed(entry), vec![subject.clone(); count], &RunOptions::default());
@@ -292,7 +294,7 @@ fn results_are_valid_level_sets_and_inputs_stay_as_they_were() {
 fn nothing_in_gives_nothing_out() {
     let nothing = LevelSet::empty(Transform::uniform(DX), 3.0);
     for entry in operators().filter(|entry| entry.arity != Arity::Source) {
-        let count = if entry.arity == Arity::Many { 2 } else { 1 };
+        let count = if entry.arity == Arity::One { 1 } else { 2 };
         let outcome = entry.run(needed(entry), vec![nothing.clone(); count], &RunOptions::default());
         let result = outcome.unwrap_or_else(|e| panic!("{}: {e}", entry.name)).level_set;
         assert!(result.is_empty() && result.check().is_empty(), "{}", entry.name);

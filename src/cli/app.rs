@@ -48,10 +48,14 @@ fn operator(entry: &Entry) -> Command {
         Arity::Many => {
             command.arg(inputs.value_name("IN").num_args(2..).help("Two or more: each a .vdb, a mesh, or `-`"))
         }
+        Arity::BaseAndSolid => {
+            let help = "The base, then the texture: each a .vdb, a mesh, or `-`; a mesh as texture gets 256 voxels along its longest axis";
+            command.arg(inputs.value_names(["BASE", "TEXTURE"]).num_args(2).help(help))
+        }
     };
     let command = match entry.arity {
         Arity::Source => command,
-        Arity::One | Arity::Many => args::conversion(args::grids(command), own),
+        Arity::One | Arity::Many | Arity::BaseAndSolid => args::conversion(args::grids(command), own),
     };
     args::output(command)
 }

@@ -31,6 +31,7 @@ pub fn run(entry: &Entry, matches: &ArgMatches, context: &Context) -> Result<()>
     let inputs = match entry.arity {
         Arity::Source => Vec::new(),
         Arity::One | Arity::Many => input::load(&paths, &input_options, &mut warnings, &context.run)?,
+        Arity::BaseAndSolid => input::load_apart(&paths, &input_options, &mut warnings, &context.run)?,
     };
     let level_sets = inputs.iter().map(|input| input.level_set.clone()).collect();
     let Outcome { level_set, mut summary } = entry.run(values, level_sets, &context.run)?;
@@ -223,7 +224,8 @@ impl Report<'_> {
             let plural = if steps == 1 { "" } else { "s" };
             text += &format!("  {steps} step{plural}{reason}\n");
         }
-        for (name, value) in &summary.details {
+        // Lists are for programs.
+        for (name, value) in summary.details.iter().filter(|(_, value)| !value.is_array()) {
             text += &format!("  {}: {value}\n", name.replace('_', " "));
         }
         text

@@ -80,6 +80,7 @@ fn option_of(parameter: &Parameter) -> Arg {
         _ => arg.value_name(kind.value_name(parameter)).allow_hyphen_values(kind.may_be_negative()),
     };
     let arg = if parameter.is_list { arg.action(ArgAction::Append) } else { arg };
+    let arg = if parameter.values > 1 { arg.num_args(parameter.values) } else { arg };
     described(arg, parameter)
 }
 
@@ -264,6 +265,7 @@ mod tests {
             kind: kind.into(),
             default: Value::Null,
             is_list: false,
+            values: 1,
             is_flag: kind == "boolean",
         }
     }

@@ -161,6 +161,28 @@ pub fn load(
     load_with(paths, options, Volume::take, warnings, run)
 }
 
+/// As [`load`], each for itself: the first as the options say, the meshes after it with voxels of their own size.
+pub fn load_apart(
+    paths: &[PathBuf],
+    options: &InputOptions,
+    warnings: &mut Vec<String>,
+    run: &RunOptions,
+) -> Result<Vec<Input>> {
+    one_pipe(paths)?;
+    let mut inputs = Vec::new();
+    for path in paths {
+        let own = InputOptions {
+            voxel_size: None,
+            resolution: None,
+            grids: options.choice(inputs.len()).grid.map(str::to_owned).into_iter().collect(),
+            ..options.clone()
+        };
+        let options = if inputs.is_empty() { options } else { &own };
+        inputs.append(&mut load(std::slice::from_ref(path), options, warnings, run)?);
+    }
+    Ok(inputs)
+}
+
 /// As [`load`], for results that go beside the grids that the level sets are read from: files stay whole.
 pub fn load_whole(
     paths: &[PathBuf],
@@ -178,10 +200,7 @@ fn load_with(
     warnings: &mut Vec<String>,
     run: &RunOptions,
 ) -> Result<Vec<Input>> {
-    if paths.iter().filter(|path| is_pipe(path)).count() > 1 {
-        let accepted = "standard input can be read once: give `-` once";
-        return Err(EditError::parameter("vdb-edit", "input", "-", accepted));
-    }
+    one_pipe(paths)?;
     // All kinds are known before anything large is read.
     for path in paths.iter().filter(|path| !is_volume(path)) {
         mesh_format(path)?;
@@ -219,6 +238,15 @@ fn load_with(
         inputs.push(Input { path: path.clone(), level_set, source, attributes });
     }
     Ok(inputs)
+}
+
+/// Refuses standard input for several inputs.
+fn one_pipe(paths: &[PathBuf]) -> Result<()> {
+    if paths.iter().filter(|path| is_pipe(path)).count() > 1 {
+        let accepted = "standard input can be read once: give `-` once";
+        return Err(EditError::parameter("vdb-edit", "input", "-", accepted));
+    }
+    Ok(())
 }
 
 /// The level set of the surface of a scalar volume at `iso`; `None` if the file holds a level set, or is none of volumes.

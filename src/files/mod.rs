@@ -6,6 +6,7 @@
 #![cfg_attr(not(feature = "cli"), allow(dead_code))]
 
 pub mod frames;
+mod grids;
 pub mod input;
 pub mod mesh_output;
 pub mod output;

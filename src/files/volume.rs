@@ -5,6 +5,7 @@ use std::path::Path;
 use glam::DVec3;
 use serde_json::{Map, Value, json};
 
+pub use super::grids::{BandState, Choice, Description, GridDescription, VolumeGrid};
 use super::output::VolumeOptions;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
@@ -21,35 +22,6 @@ const NEW_NAME: &str = "surface";
 /// An open `.vdb` file.
 pub struct Volume {
     file: VdbFile,
-}
-
-/// A level set of a file, as it was read.
-pub struct VolumeGrid {
-    /// The level set; its band may have to be made regular first.
-    pub level_set: LevelSet,
-    /// Its place in the file.
-    pub index: usize,
-    /// How it is selected.
-    pub selector: String,
-    /// What its band needs.
-    pub band: BandState,
-}
-
-/// What a band needs to be a regular one.
-pub enum BandState {
-    /// Nothing.
-    Regular,
-    /// To be cut to this half width.
-    Trim { half_width: f32, what: String },
-    /// To be made anew; `gross` if the values may be no distances at all.
-    Rebuild { what: String, gross: bool },
-}
-
-/// Whether grids of this class may be taken for level sets, and which one is meant.
-#[derive(Clone, Copy)]
-pub struct Choice<'a> {
-    pub grid: Option<&'a str>,
-    pub assume_level_set: bool,
 }
 
 /// Opens a file; `-` is standard input.
@@ -163,31 +135,6 @@ pub fn write_field(
     let file = from.map(|volume| &volume.file);
     let report = crate::vdb::write_with_fields(path, grids, &[field], file, &WriteOptions::default())?;
     Ok((report.bytes, report.warnings))
-}
-
-/// What a file says of itself, and its level sets.
-pub struct Description {
-    /// As JSON.
-    pub metadata: Map<String, Value>,
-    /// Format and library.
-    pub format: String,
-    /// Its grids.
-    pub grids: Vec<GridDescription>,
-}
-
-/// A grid of a file.
-pub struct GridDescription {
-    pub name: String,
-    pub selector: String,
-    pub value_type: String,
-    pub class: String,
-    pub voxel_size: DVec3,
-    pub active_voxels: Option<u64>,
-    pub bounds: Option<(DVec3, DVec3)>,
-    pub storage: String,
-    pub metadata: Map<String, Value>,
-    /// Its level set, the reason why it cannot be read as one, or `None` if it does not claim to be one.
-    pub level_set: Option<std::result::Result<VolumeGrid, String>>,
 }
 
 /// Describes a file, or one grid of it.

@@ -3,9 +3,7 @@
 use std::convert::Infallible;
 use std::path::Path;
 
-use glam::DVec3;
-use serde_json::{Map, Value};
-
+pub use super::grids::{BandState, Choice, Description, GridDescription, VolumeGrid};
 use super::output::VolumeOptions;
 use crate::error::{EditError, Result};
 use crate::levelset::{Field, LevelSet};
@@ -16,30 +14,6 @@ const ABSENT: &str = "this vdb-edit was built without OpenVDB; build it with the
 
 /// An open `.vdb` file: there is none.
 pub struct Volume(Infallible);
-
-/// A level set of a file.
-pub struct VolumeGrid {
-    pub level_set: LevelSet,
-    pub index: usize,
-    pub selector: String,
-    pub band: BandState,
-}
-
-/// What a band needs to be a regular one.
-#[allow(dead_code)] // never made here, and matched on as in the build with OpenVDB
-pub enum BandState {
-    Regular,
-    Trim { half_width: f32, what: String },
-    Rebuild { what: String, gross: bool },
-}
-
-/// Which grid is meant.
-#[derive(Clone, Copy)]
-#[allow(dead_code)] // nothing is chosen here
-pub struct Choice<'a> {
-    pub grid: Option<&'a str>,
-    pub assume_level_set: bool,
-}
 
 /// Refuses.
 pub fn open(path: &Path, _: &RunOptions) -> Result<Volume> {
@@ -98,27 +72,6 @@ pub struct FieldToWrite<'a> {
 /// Refuses.
 pub fn write_field(path: &Path, _: &LevelSet, _: FieldToWrite, _: Option<&Volume>) -> Result<(u64, Vec<String>)> {
     Err(EditError::output(path, ABSENT))
-}
-
-/// What a file says of itself, and its level sets.
-pub struct Description {
-    pub metadata: Map<String, Value>,
-    pub format: String,
-    pub grids: Vec<GridDescription>,
-}
-
-/// A grid of a file.
-pub struct GridDescription {
-    pub name: String,
-    pub selector: String,
-    pub value_type: String,
-    pub class: String,
-    pub voxel_size: DVec3,
-    pub active_voxels: Option<u64>,
-    pub bounds: Option<(DVec3, DVec3)>,
-    pub storage: String,
-    pub metadata: Map<String, Value>,
-    pub level_set: Option<std::result::Result<VolumeGrid, String>>,
 }
 
 /// Refuses.

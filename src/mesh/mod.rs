@@ -17,6 +17,7 @@ mod rebuild;
 mod scatter;
 mod shell;
 mod simplify;
+mod spline;
 #[cfg(test)]
 mod testing;
 mod to_levelset;
@@ -38,6 +39,7 @@ pub use rebuild::{Rebuild, level_set_of_mesh, onto_lattice, rebuild, rebuild_whe
 pub use scatter::{UnsignedLeaf, distance_to_triangles};
 pub use shell::shell;
 pub use simplify::{Bound, Simplified, simplify};
+pub use spline::{Spline, double_reflection};
 pub use to_levelset::{MeshToLevelSet, mesh_to_level_set};
 pub use topology::{Topology, analyze};
 pub use winding::WindingNumber;

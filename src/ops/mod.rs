@@ -18,6 +18,7 @@ pub mod morphology;
 mod params;
 pub mod reconstruct;
 mod registry;
+mod rolling;
 pub mod segment;
 mod sequence;
 pub mod shape;
@@ -26,6 +27,7 @@ pub mod smooth;
 pub mod smooth_csg;
 mod solver;
 pub mod sweep;
+pub mod texture;
 pub mod transform;
 pub mod warp;
 

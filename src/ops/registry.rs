@@ -20,6 +20,8 @@ pub enum Arity {
     One,
     /// Two or more.
     Many,
+    /// A base, and a solid that is put on it in a size of its own: of two meshes each gets voxels of its own size.
+    BaseAndSolid,
 }
 
 /// What an operator did, beside its result.
@@ -91,6 +93,8 @@ pub struct Parameter {
     pub default: Value,
     /// Whether several values make a list.
     pub is_list: bool,
+    /// How many values are typed after its option.
+    pub values: usize,
     /// Whether naming it is enough.
     pub is_flag: bool,
 }
@@ -135,6 +139,7 @@ impl ParameterSet {
                 kind: kind_of(property),
                 default: defaults.get(name).cloned().unwrap_or(Value::Null),
                 is_list: property.get("x-list").is_some(),
+                values: property.get("x-count").and_then(Value::as_u64).unwrap_or(1) as usize,
                 is_flag: property.get("type").is_some_and(|t| t == "boolean"),
             })
             .collect()
@@ -203,12 +208,14 @@ impl Entry {
             Arity::Source => inputs.is_empty(),
             Arity::One => inputs.len() == 1,
             Arity::Many => inputs.len() >= 2,
+            Arity::BaseAndSolid => inputs.len() == 2,
         };
         if !fits {
             let accepted = match self.arity {
                 Arity::Source => "it takes no input",
                 Arity::One => "it takes one input",
                 Arity::Many => "it takes two or more inputs",
+                Arity::BaseAndSolid => "it takes two inputs, the base and the texture",
             };
             return Err(EditError::parameter(self.name, "inputs", inputs.len(), accepted));
         }
@@ -228,6 +235,7 @@ pub static REGISTRY: &[Entry] = &[
     Entry::of::<super::sharpen::Sharpen>(),
     Entry::of::<super::fillet::Fillet>(),
     Entry::of::<super::emboss::Emboss>(),
+    Entry::of::<super::texture::Texture>(),
     Entry::of::<super::warp::Warp>(),
     Entry::of::<super::sweep::Sweep>(),
     Entry::of::<super::advect::Advect>(),

@@ -21,7 +21,7 @@ use super::solver::RegionSpecs;
 use crate::error::{EditError, Result};
 use crate::grid::MAX_COORD;
 use crate::levelset::LevelSet;
-use crate::mesh::{Rebuild, rebuild};
+use crate::mesh::{Rebuild, Spline, double_reflection, rebuild};
 use crate::region::Region;
 use crate::run::RunOptions;
 
@@ -145,7 +145,7 @@ pub fn sweep(
     });
     // Motions of index space.
     let (to_world, to_index) = (transform.to_world(), transform.to_index());
-    let places: Vec<DAffine3> = path.motions(turning, |motion| {
+    let places: Vec<DAffine3> = motions(path, turning, |motion| {
         let motion = to_index * motion * to_world;
         (motion, corners.map(|c| motion.transform_point3(c)))
     })?;
@@ -206,104 +206,46 @@ pub fn sweep(
     Ok((result, places.len()))
 }
 
-/// A natural cubic spline through points, its parameter the length of the chords.
-pub struct Spline {
-    points: Vec<DVec3>,
-    /// Length of the chord after each point but the last.
-    chords: Vec<f64>,
-    /// Second derivatives.
-    bends: Vec<DVec3>,
-}
-
-impl Spline {
-    /// Through points of which no two neighbours are equal.
-    pub fn through(points: &[DVec3]) -> Self {
-        let chords: Vec<f64> = points.windows(2).map(|w| w[0].distance(w[1])).collect();
-        let n = points.len();
-        let mut bends = vec![DVec3::ZERO; n];
-        // h₋ m₋ + 2(h₋ + h₊) m + h₊ m₊ = 6 (d₊ − d₋), no bend at the ends: elimination and back substitution.
-        let (mut factors, mut rights) = (vec![0.0; n], vec![DVec3::ZERO; n]);
-        for i in 1..n.saturating_sub(1) {
-            let (a, b) = (chords[i - 1], chords[i]);
-            let slope = |k: usize| (points[k + 1] - points[k]) / chords[k];
-            let pivot = 2.0 * (a + b) - a * factors[i - 1];
-            factors[i] = b / pivot;
-            rights[i] = ((slope(i) - slope(i - 1)) * 6.0 - rights[i - 1] * a) / pivot;
-        }
-        for i in (1..n.saturating_sub(1)).rev() {
-            bends[i] = rights[i] - bends[i + 1] * factors[i];
-        }
-        Self { points: points.to_vec(), chords, bends }
-    }
-
-    /// Point and tangent (a unit vector) at part `t` (0..1) of piece `i`.
-    fn at(&self, i: usize, t: f64) -> (DVec3, DVec3) {
-        let (h, s) = (self.chords[i], 1.0 - t);
-        let (p, q, m, n) = (self.points[i], self.points[i + 1], self.bends[i], self.bends[i + 1]);
-        let square = h * h / 6.0;
-        let point = p * s + q * t + (m * (s * s * s - s) + n * (t * t * t - t)) * square;
-        let slope = (q - p) / h + (n * (3.0 * t * t - 1.0) - m * (3.0 * s * s - 1.0)) * (h / 6.0);
-        (point, slope.try_normalize().unwrap_or((q - p) / h))
-    }
-
-    /// The motions of the world from the start along the path, so close that `traced` points of the solid move by half a voxel at most.
-    fn motions<const N: usize>(
-        &self,
-        turning: Turning,
-        traced: impl Fn(DAffine3) -> (DAffine3, [DVec3; N]),
-    ) -> Result<Vec<DAffine3>> {
-        let (start, tangent) = self.at(0, 0.0);
-        let first = DMat3::from_cols(
-            tangent.any_orthonormal_vector(),
-            tangent.cross(tangent.any_orthonormal_vector()),
-            tangent,
-        );
-        let motion = |point: DVec3, frame: &DMat3| {
-            let turn = if turning == Turning::Path { *frame * first.transpose() } else { DMat3::IDENTITY };
-            DAffine3::from_translation(point) * DAffine3::from_mat3(turn) * DAffine3::from_translation(-start)
-        };
-        let (mut before, mut frame) = ((start, tangent), first);
-        let (mut placed, mut trace) = traced(motion(start, &frame));
-        let mut motions = vec![placed];
-        for i in 0..self.chords.len() {
-            let mut t = 0.0;
-            let mut step: f64 = 1.0 / PIECES as f64;
-            while t < 1.0 {
-                let next = (t + step).min(1.0);
-                let after = self.at(i, next);
-                let carried = double_reflection(&frame, before, after);
-                let (there, moved) = traced(motion(after.0, &carried));
-                let most = moved.iter().zip(&trace).map(|(a, b)| a.distance(*b)).fold(0.0, f64::max);
-                if most > OVERLAP {
-                    // Shorter by what it was too long.
-                    step = (next - t) * (0.9 * OVERLAP / most).min(0.9);
-                    if motions.len() > MOST_PLACES || step < 1e-9 {
-                        let accepted = format!("a path along which half voxels are at most {MOST_PLACES} steps");
-                        return Err(EditError::parameter(Sweep::NAME, "through", self.points.len(), accepted));
-                    }
-                    continue;
-                }
-                (t, before, frame, placed, trace) = (next, after, carried, there, moved);
-                motions.push(placed);
-                step = (step * (0.9 * OVERLAP / most.max(1e-12)).min(2.0)).min(1.0 / PIECES as f64);
-            }
-        }
-        Ok(motions)
-    }
-}
-
-/// The frame (two normals, tangent) carried from a point and tangent to the next by two reflections, turning as little as can be.
-fn double_reflection(frame: &DMat3, (x, _): (DVec3, DVec3), (y, tangent): (DVec3, DVec3)) -> DMat3 {
-    let reflect = |v: DVec3, along: DVec3| {
-        let squared = along.length_squared();
-        if squared > 0.0 { v - along * (2.0 * v.dot(along) / squared) } else { v }
+/// The motions of the world from the start along a path, so close that `traced` points of the solid move by half a voxel at most.
+fn motions<const N: usize>(
+    path: &Spline,
+    turning: Turning,
+    traced: impl Fn(DAffine3) -> (DAffine3, [DVec3; N]),
+) -> Result<Vec<DAffine3>> {
+    let (start, tangent) = path.at(0, 0.0);
+    let first =
+        DMat3::from_cols(tangent.any_orthonormal_vector(), tangent.cross(tangent.any_orthonormal_vector()), tangent);
+    let motion = |point: DVec3, frame: &DMat3| {
+        let turn = if turning == Turning::Path { *frame * first.transpose() } else { DMat3::IDENTITY };
+        DAffine3::from_translation(point) * DAffine3::from_mat3(turn) * DAffine3::from_translation(-start)
     };
-    let chord = y - x;
-    let (normal, turned) = (reflect(frame.x_axis, chord), reflect(frame.z_axis, chord));
-    let normal = reflect(normal, tangent - turned);
-    // Rounding would add up over many steps.
-    let normal = (normal - tangent * normal.dot(tangent)).try_normalize().unwrap_or(frame.x_axis);
-    DMat3::from_cols(normal, tangent.cross(normal), tangent)
+    let (mut before, mut frame) = ((start, tangent), first);
+    let (mut placed, mut trace) = traced(motion(start, &frame));
+    let mut motions = vec![placed];
+    for i in 0..path.pieces() {
+        let mut t = 0.0;
+        let mut step: f64 = 1.0 / PIECES as f64;
+        while t < 1.0 {
+            let next = (t + step).min(1.0);
+            let after = path.at(i, next);
+            let carried = double_reflection(&frame, before, after);
+            let (there, moved) = traced(motion(after.0, &carried));
+            let most = moved.iter().zip(&trace).map(|(a, b)| a.distance(*b)).fold(0.0, f64::max);
+            if most > OVERLAP {
+                // Shorter by what it was too long.
+                step = (next - t) * (0.9 * OVERLAP / most).min(0.9);
+                if motions.len() > MOST_PLACES || step < 1e-9 {
+                    let accepted = format!("a path along which half voxels are at most {MOST_PLACES} steps");
+                    return Err(EditError::parameter(Sweep::NAME, "through", path.pieces() + 1, accepted));
+                }
+                continue;
+            }
+            (t, before, frame, placed, trace) = (next, after, carried, there, moved);
+            motions.push(placed);
+            step = (step * (0.9 * OVERLAP / most.max(1e-12)).min(2.0)).min(1.0 / PIECES as f64);
+        }
+    }
+    Ok(motions)
 }
 
 #[cfg(test)]
@@ -359,45 +301,6 @@ mod tests {
         assert!(turned.sampler().trilinear(beside) < 0.0 && fixed.sampler().trilinear(beside) > 0.0);
         let ahead = DVec3::new(35.0, 0.0, 30.0);
         assert!(turned.sampler().trilinear(ahead) > 0.0 && fixed.sampler().trilinear(ahead) < 0.0);
-    }
-
-    #[test]
-    fn frames_of_a_helix_turn_by_its_torsion() {
-        // A rotation minimising frame turns against the Frenet frame by ∫τ ds; the analytic frame of the helix (cos, sin, c·t) gives the angle.
-        let c = 0.5f64;
-        let speed = (1.0 + c * c).sqrt();
-        let at = |t: f64| (DVec3::new(t.cos(), t.sin(), c * t), DVec3::new(-t.sin(), t.cos(), c) / speed);
-        let normal = |t: f64| DVec3::new(-t.cos(), -t.sin(), 0.0);
-        let error = |n: usize| {
-            let (_, tangent) = at(0.0);
-            let mut frame = DMat3::from_cols(normal(0.0), tangent.cross(normal(0.0)), tangent);
-            for k in 0..n {
-                let [a, b] = [k, k + 1].map(|k| std::f64::consts::TAU * k as f64 / n as f64);
-                frame = double_reflection(&frame, at(a), at(b));
-            }
-            let binormal = at(std::f64::consts::TAU).1.cross(normal(0.0));
-            let angle = frame.x_axis.dot(binormal).atan2(frame.x_axis.dot(normal(0.0)));
-            let expected = -c / speed * std::f64::consts::TAU;
-            let turn = (angle - expected) / std::f64::consts::TAU;
-            ((turn - turn.round()) * std::f64::consts::TAU).abs()
-        };
-        let (coarse, fine) = (error(16), error(32));
-        assert!(coarse < 1e-3 && fine < coarse / 12.0, "{coarse} {fine}");
-    }
-
-    #[test]
-    fn a_spline_runs_through_its_points_without_a_kink() {
-        let points = [DVec3::ZERO, DVec3::new(3.0, 1.0, 0.0), DVec3::new(5.0, -1.0, 2.0), DVec3::new(5.5, 0.0, 7.0)];
-        let spline = Spline::through(&points);
-        for i in 0..3 {
-            assert!(
-                (spline.at(i, 0.0).0 - points[i]).length() < 1e-12
-                    && (spline.at(i, 1.0).0 - points[i + 1]).length() < 1e-12
-            );
-        }
-        for i in 0..2 {
-            assert!((spline.at(i, 1.0).1 - spline.at(i + 1, 0.0).1).length() < 1e-9);
-        }
     }
 
     #[test]

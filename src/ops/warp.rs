@@ -1,7 +1,6 @@
 //! Dragging: handles of a solid are moved, and the rest follows smoothly.
 //!
-//! The displacement is interpolated by radial basis functions with φ(r) = r and a linear polynomial (Brodersen et al. 2007, equation 2, with
-//! the signs that make it solvable):
+//! The displacement is interpolated by radial basis functions with φ(r) = r and a linear polynomial ([`rbf`](crate::rbf)):
 //!
 //! > u(x) = Σ ωᵢ |x − pᵢ| + R x + t,  u(pᵢ) = qᵢ − pᵢ,  Σ ωᵢ = 0,  Σ ωᵢ pᵢᵀ = 0
 //!
@@ -12,7 +11,6 @@
 //! moved polygons are exact. Where det(I + ∇(αu)) ≤ 0 the map folds and is refused.
 
 use glam::{DMat3, DVec3};
-use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -24,6 +22,7 @@ use super::solver::RegionSpecs;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{level_set_of_mesh, level_set_to_mesh};
+use crate::rbf::{Basis, Interpolant};
 use crate::region::Region;
 use crate::run::RunOptions;
 
@@ -46,9 +45,6 @@ const MOST_POINTS: usize = 1000;
 
 /// Handles nearer to each other than this part of their extent count as one.
 const SAME_PLACE: f64 = 1e-9;
-
-/// Least extent of the handles across a plane, as a part of their extent along it, for a linear polynomial.
-const SPANNING: f64 = 1e-3;
 
 impl Warp {
     /// Places and displacements.
@@ -158,66 +154,30 @@ pub fn warp(
 }
 
 /// A smooth displacement through those of handles.
-pub struct Displacement {
-    centre: DVec3,
-    scale: f64,
-    points: Vec<DVec3>,
-    weights: Vec<DVec3>,
-    linear: DMat3,
-    shift: DVec3,
-}
+pub struct Displacement(Interpolant);
 
 impl Displacement {
     /// Interpolates displacements at points, which must be distinct.
     pub fn new(pairs: &[(DVec3, DVec3)]) -> Result<Self> {
-        let n = pairs.len();
-        let centre = pairs.iter().map(|p| p.0).sum::<DVec3>() / n.max(1) as f64;
-        let extent = pairs.iter().map(|p| p.0.distance(centre)).fold(0.0, f64::max);
+        let (points, values): (Vec<DVec3>, Vec<DVec3>) = pairs.iter().copied().unzip();
+        let centre = points.iter().sum::<DVec3>() / points.len().max(1) as f64;
+        let extent = points.iter().map(|p| p.distance(centre)).fold(0.0, f64::max);
         // Coordinates of the order of 1: lengths do not change the solution, but its digits.
-        let scale = if extent > 0.0 { extent } else { 1.0 };
-        let points: Vec<DVec3> = pairs.iter().map(|p| (p.0 - centre) / scale).collect();
+        let unit = if extent > 0.0 { extent } else { 1.0 };
         for (i, p) in points.iter().enumerate() {
-            if points[..i].iter().any(|q| q.distance(*p) < SAME_PLACE) {
+            if points[..i].iter().any(|q| q.distance(*p) < SAME_PLACE * unit) {
                 let accepted = "handles and fixed points at different places";
-                return Err(EditError::parameter(Warp::NAME, "handle", pairs[i].0, accepted));
+                return Err(EditError::parameter(Warp::NAME, "handle", p, accepted));
             }
         }
-        let spread = DMatrix::from_fn(n, 3, |i, axis| points[i][axis]);
-        let thickness = spread.singular_values().iter().copied().fold(f64::INFINITY, f64::min);
-        let columns = if n >= 4 && thickness > SPANNING { 4 } else { 1 };
-        let polynomial = |i: usize, k: usize| if k == 0 { 1.0 } else { points[i][k - 1] };
-        let matrix = DMatrix::from_fn(n + columns, n + columns, |i, j| match (i < n, j < n) {
-            (true, true) => points[i].distance(points[j]),
-            (true, false) => polynomial(i, j - n),
-            (false, true) => polynomial(j, i - n),
-            (false, false) => 0.0,
-        });
-        let equations = matrix.lu();
-        let solve = |axis: usize| {
-            let right = DVector::from_fn(n + columns, |i, _| pairs.get(i).map_or(0.0, |p| p.1[axis]));
-            equations.solve(&right).filter(|s| s.iter().all(|v| v.is_finite()))
-        };
-        let (Some(x), Some(y), Some(z)) = (solve(0), solve(1), solve(2)) else {
-            let accepted = "handles and fixed points that are not so close to each other";
-            return Err(EditError::parameter(Warp::NAME, "handle", n, accepted));
-        };
-        let row = |i: usize| DVec3::new(x[i], y[i], z[i]);
-        let column = |k: usize| if columns == 4 { row(n + k) } else { DVec3::ZERO };
-        Ok(Self {
-            centre,
-            scale,
-            weights: (0..n).map(row).collect(),
-            linear: DMat3::from_cols(column(1), column(2), column(3)),
-            shift: row(n),
-            points,
-        })
+        let interpolant = Interpolant::new(&points, &values, |_| 0.0, Basis::Linear, unit);
+        let accepted = "handles and fixed points that are not so close to each other";
+        interpolant.map(Self).ok_or_else(|| EditError::parameter(Warp::NAME, "handle", pairs.len(), accepted))
     }
 
     /// u at a point.
     pub fn at(&self, x: DVec3) -> DVec3 {
-        let x = (x - self.centre) / self.scale;
-        let sum: DVec3 = self.points.iter().zip(&self.weights).map(|(p, w)| *w * p.distance(x)).sum();
-        sum + self.linear * x + self.shift
+        self.0.at(x)
     }
 }
 

@@ -271,31 +271,36 @@ mod tests {
         let centre = DVec3::new(0.3, 0.1, -0.2);
         let velocity = DVec3::new(1.0, -0.5, 0.25);
         let field = move |_: DVec3| velocity;
-        for (scheme, integrator, tolerance) in [
-            // First order diffuses by V(1 − c)h/2 on each axis: 0.36, 0.21 and 0.12 with c of 0.29, 0.14 and 0.07. In a time of 5 the surface
-            // shrinks by 5(0.36 + 0.21)/12 = 0.24 where z is its normal; renormalisation of first order adds to it.
-            (UpwindScheme::First, TimeIntegrator::TvdRk1, 0.4),
-            (UpwindScheme::HjWeno5, TimeIntegrator::TvdRk2, 0.03),
-        ] {
+        for (scheme, integrator, tolerance) in
+            [(UpwindScheme::First, TimeIntegrator::TvdRk1, 0.16), (UpwindScheme::HjWeno5, TimeIntegrator::TvdRk2, 0.03)]
+        {
             let solver = SolverOptions { scheme, integrator, ..SOLVER };
             let (moved, report) = carried(&ball(centre, 12.0), &field, None, Until::Time(5.0), &solver);
             assert!((report.time - 5.0).abs() < 1e-12);
-            let worst = error(&moved, |p| (p - centre - velocity * 5.0).length() - 12.0);
+            // First order diffuses by D = |V|(1 − c)h/2 along each axis, c = |V|dt/h (its modified equation). On a ball φ_xx = (1 − n_x²)/R, so that
+            // the surface shrinks by t Σ D(1 − n²)/R: 0.24 where z is the normal. Renormalisation of first order adds up to 0.0028·20/R a step (docs/NUMERICS.md): 0.085 in 18,
+            // and leaves distances that are wrong by as much again a voxel from the surface.
+            let part = velocity.abs() * (5.0 / f64::from(report.steps));
+            let spread = if scheme == UpwindScheme::First { velocity.abs() * (1.0 - part) / 2.0 } else { DVec3::ZERO };
+            let worst = error(&moved, |p| {
+                let from = p - centre - velocity * 5.0;
+                let normal = from.normalize_or_zero();
+                from.length() - 12.0 + 5.0 * spread.dot(1.0 - normal * normal) / 12.0
+            });
             assert!(worst < tolerance, "{scheme:?} {worst}");
         }
     }
 
     #[test]
     fn a_flow_without_divergence_keeps_the_volume() {
-        // Rotation about z, and waves along x: neither has a divergence, nor draws the solid out until it is thin. A shear does: by a factor
-        // of 4 a ball of 12 voxels loses 2 %.
+        // Rotation about z, and a shear, which in 100 steps draws the ball out to twice its length.
         let run = RunOptions::default();
         // Without edges, which any scheme rounds.
-        let solid = ball(DVec3::X * 8.0, 12.0);
+        let solid = ball(DVec3::X * 8.0, 16.0);
         let before = solid.measure(&run).unwrap().volume;
         let turning = |p: DVec3| DVec3::new(-p.y, p.x, 0.0);
-        let waving = |p: DVec3| DVec3::new(1.0, 0.0, 0.2 * (p.x * 0.2).sin());
-        for field in [&turning as &dyn VelocityField, &waving] {
+        let shearing = |p: DVec3| DVec3::new(p.z, 0.0, 0.0);
+        for field in [&turning as &dyn VelocityField, &shearing] {
             let (moved, report) = carried(&solid, field, None, Until::Iterations(100), &SOLVER);
             assert_eq!(report.steps, 100);
             let after = moved.measure(&run).unwrap().volume;

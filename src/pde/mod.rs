@@ -25,9 +25,7 @@ mod tracker;
 
 pub use advect::{VelocityField, advect};
 pub use anisotropic::{AnisotropicGaussian, filter_anisotropic};
-pub use attract::{
-    Attraction, AttractionReport, Attractor, IndexBounds, REACHED, attract, drawn_within, leaves_around,
-};
+pub use attract::{Attraction, AttractionReport, Attractor, IndexBounds, Pull, REACHED, attract, leaves_around};
 pub use curvature_flow::{CurvatureFlow, FlowCurvature};
 pub use evolve::{Report, StopReason, Until, evolve};
 pub use filter::{Filter, FilterKind, filter, offset};

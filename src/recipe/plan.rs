@@ -14,7 +14,7 @@ use crate::error::{EditError, Result};
 use crate::files::frames::numbered;
 use crate::files::input::{self, InputOptions};
 use crate::files::output::{Output, writable};
-use crate::ops::Entry;
+use crate::ops::{Arity, Entry};
 use crate::spec::rebased;
 
 /// A recipe at one frame, ready to run.
@@ -33,6 +33,13 @@ pub(super) struct Planned {
     pub inputs: Vec<Given>,
     pub action: Action,
     values: Map<String, Value>,
+}
+
+impl Planned {
+    /// Whether the meshes it takes get voxels of their own size, each for itself.
+    pub fn takes_solids_apart(&self) -> bool {
+        matches!(&self.action, Action::Operator(entry, _) if entry.arity == Arity::BaseAndSolid)
+    }
 }
 
 /// What a step takes.

@@ -206,8 +206,12 @@ impl Running<'_> {
         if files.is_empty() {
             return Ok(taken.into_iter().flatten().collect());
         }
-        let options = beside(planned, &taken);
-        let mut loaded = input::load(&files, &options, warnings, self.run)?.into_iter().map(Slot::from);
+        let loaded = if planned.takes_solids_apart() {
+            input::load_apart(&files, &InputOptions::default(), warnings, self.run)?
+        } else {
+            input::load(&files, &beside(planned, &taken), warnings, self.run)?
+        };
+        let mut loaded = loaded.into_iter().map(Slot::from);
         Ok(taken.into_iter().filter_map(|slot| slot.or_else(|| loaded.next())).collect())
     }
 

@@ -136,6 +136,7 @@ impl Op {
             Self::Operator(entry) => match entry.arity {
                 Arity::Source => (0, 0, "no input: it makes a level set of nothing"),
                 Arity::One => (1, 1, "one input: `input = \"…\"`"),
+                Arity::BaseAndSolid => (2, 2, "two inputs, base and texture: `inputs = [\"…\", \"…\"]`"),
                 Arity::Many => (2, usize::MAX, "two inputs or more: `inputs = [\"…\", \"…\"]`"),
             },
             Self::Convert => (1, 1, "one input: `input = \"…\"`, a file"),

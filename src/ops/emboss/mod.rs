@@ -21,6 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use self::outline::Drawing;
 use self::patch::Patch;
+pub(in crate::ops) use self::patch::Patch as Flat;
 use self::picture::Picture;
 use self::stamp::{Motif, Stamp};
 pub(super) use self::targets::read_polylines;
@@ -34,7 +35,7 @@ use crate::grid::LEAF_DIM;
 use crate::levelset::LevelSet;
 use crate::mesh::Bvh;
 use crate::pde::{
-    Attraction, AttractionReport, Attractor, CutOff, REACHED, Report, SolverOptions, StopReason, attract, drawn_within,
+    Attraction, AttractionReport, Attractor, CutOff, Pull, REACHED, Report, SolverOptions, StopReason, attract,
     leaves_around,
 };
 use crate::region::Region;
@@ -449,18 +450,20 @@ impl Emboss {
         region: Option<&dyn Region>,
         run: &RunOptions,
     ) -> Result<AttractionReport> {
-        let Some(within) = drawn_within(level_set, target, how, region, run)? else {
+        let nothing = |level_set: &LevelSet| {
             let voxels = level_set.grid().active_voxels();
             let flow = Report { steps: 0, time: 0.0, voxels, stopped: StopReason::AtRest };
-            return Ok(AttractionReport { flow, gap: 0.0, stalled: false, moved: Default::default() });
+            AttractionReport { flow, gap: 0.0, stalled: false, moved: Default::default() }
         };
+        let Some(pull) = Pull::new(level_set, target, how, region, run)? else { return Ok(nothing(level_set)) };
+        let Some(within) = pull.drawn_within(level_set, run)? else { return Ok(nothing(level_set)) };
         // The band of what moved reaches into so many leaves around it.
         let half_width = f64::from(level_set.half_width());
         let rings = ((half_width + 1.0) / f64::from(LEAF_DIM)).ceil();
         let margin = f64::from(LEAF_DIM) * (rings + 1.0) + 2.0 * half_width + 4.0;
         let mut part = cut_out(level_set, within, margin, run)?;
         let until = self.evolution.until_rest(MOST_ITERATIONS);
-        let report = attract(&mut part, target, how, region, within, until, run)?;
+        let report = attract(&mut part, &pull, within, until, run)?;
         let mut leaves = report.moved.clone();
         for _ in 0..rings as u32 {
             leaves = leaves.into_iter().flat_map(leaves_around).collect();

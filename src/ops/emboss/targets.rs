@@ -108,8 +108,8 @@ fn obj_lines(text: &str) -> Result<Vec<Vec<DVec3>>, String> {
 pub(super) struct Surface<'a>(pub &'a Bvh);
 
 impl Attractor for Surface<'_> {
-    fn closest(&self, ijk: DVec3) -> Option<DVec3> {
-        self.0.closest_point(ijk, f64::INFINITY).map(|hit| hit.point)
+    fn closest(&self, ijk: DVec3, within: f64) -> Option<DVec3> {
+        self.0.closest_point(ijk, within).map(|hit| hit.point)
     }
 }
 
@@ -126,8 +126,8 @@ impl<'a> Solid<'a> {
 }
 
 impl Attractor for Solid<'_> {
-    fn closest(&self, ijk: DVec3) -> Option<DVec3> {
-        if self.winding.at(ijk) > 0.5 { Some(ijk) } else { self.surface.closest(ijk) }
+    fn closest(&self, ijk: DVec3, within: f64) -> Option<DVec3> {
+        if self.winding.at(ijk) > 0.5 { Some(ijk) } else { self.surface.closest(ijk, within) }
     }
 }
 

@@ -2,8 +2,9 @@ use glam::{DVec3, IVec3};
 
 use super::*;
 use crate::grid::{Transform, offset_to_local};
+use crate::levelset::sweep_distance;
 use crate::levelset::testing::box_distance;
-use crate::mesh::{Rebuild, level_set_to_mesh, rebuild};
+use crate::mesh::level_set_to_mesh;
 use crate::region::{Near, Primitive, Shape};
 use crate::stencil::simd::{Isa, choose};
 
@@ -326,36 +327,43 @@ fn noisy_box() -> LevelSet {
             values.0[at] = (f64::from(values.0[at]) + n).clamp(-5.99, 5.99) as f32;
         }
     });
-    rebuild(&level_set, &Rebuild::band(3.0), &RunOptions::default()).unwrap()
+    // Distances by sweeping, as in the independent computation: polygons would cut the edges off.
+    sweep_distance(&level_set, 3.0, &RunOptions::default()).unwrap()
 }
 
 /// Roughness of the faces (rms) and how far the edges have retreated along their bisectors.
 fn faces_and_edges(level_set: &LevelSet) -> [f64; 2] {
     let mesh = level_set_to_mesh(level_set, 0.0, &RunOptions::default()).unwrap();
-    let (mut squares, mut count) = (0.0, 0.0);
+    let (mut squares, mut count_of_faces) = (0.0, 0.0);
     for p in &mesh.positions {
         let mut a = p.abs().to_array();
         a.sort_by(f64::total_cmp);
         if a[1] < 10.0 {
             squares += box_distance(*p, DVec3::splat(16.3)).powi(2);
-            count += 1.0;
+            count_of_faces += 1.0;
         }
     }
     let mut sampler = level_set.sampler();
-    let mut retreat = 0.0;
-    for z in -8..=8 {
-        let at = |i: i32| 12.0 + f64::from(i) * 0.02;
-        let last =
-            (0..400).filter(|&i| sampler.trilinear(DVec3::new(at(i), at(i), f64::from(z))) < 0.0).last().unwrap();
-        retreat += (16.3 - at(last)) * 2f64.sqrt();
+    let (mut retreat, mut count) = (0.0, 0.0);
+    for edge in 0..12 {
+        let sign = |bit: i32| f64::from(1 - 2 * (edge & bit).min(1));
+        for z in -8..=8 {
+            let at = |i: i32| 12.0 + f64::from(i) * 0.02;
+            let place = |i: i32| {
+                let p = DVec3::new(sign(1) * at(i), sign(2) * at(i), f64::from(z));
+                [p, DVec3::new(p.y, p.z, p.x), DVec3::new(p.z, p.x, p.y)][edge as usize / 4]
+            };
+            let last = (0..400).filter(|&i| sampler.trilinear(place(i)) < 0.0).last().unwrap();
+            retreat += (16.3 - at(last)) * 2f64.sqrt();
+            count += 1.0;
+        }
     }
-    [f64::sqrt(squares / count), retreat / 17.0]
+    [f64::sqrt(squares / count_of_faces), retreat / count]
 }
 
 #[test]
 fn shapes_are_preserved_where_noise_goes() {
     let noisy = noisy_box();
-    // Its polygons have cut off some of the edges already.
     let [rough, start] = faces_and_edges(&noisy);
     assert!((rough - 0.33).abs() < 0.05, "{rough}");
     let of = |critical_curvature: Option<f32>, times: u32| {
@@ -370,13 +378,15 @@ fn shapes_are_preserved_where_noise_goes() {
     {
         let [found_face, found_edge] = of(critical, times);
         assert!((found_face - face).abs() < 0.04, "{critical:?} {times}: faces {found_face}");
-        // There the edges start at 0.166.
-        let (retreat, stated) = (found_edge - start, edge - 0.166);
-        // The edge of one noise retreats by some 15 % more or less than that of another.
-        assert!(
-            (retreat - stated).abs() < 0.3f64.max(0.15 * stated),
-            "{critical:?} {times}: edges {retreat}, {stated}"
-        );
+        match critical {
+            // The mean of all twelve edges, of one noise or another: 1.51 to 1.59 and 2.64 to 2.68 there in four of them.
+            None => assert!((found_edge - edge).abs() < 0.06, "{times}: edges {found_edge}"),
+            // Edges that are kept keep what the noise did to them: 0.17 there before the filter.
+            Some(_) => {
+                let (retreat, stated) = (found_edge - start, edge - 0.166);
+                assert!((retreat - stated).abs() < 0.3, "{times}: edges {retreat}, {stated}");
+            }
+        }
     }
 }
 

@@ -1,0 +1,224 @@
+//! A patch with the space above it.
+
+use std::fmt::Write as _;
+
+use glam::{DVec3, IVec3};
+
+use super::OPERATION;
+use super::cells::{Cells, Distortion};
+use super::level::Level;
+use super::patch::{Net, broken, corners_on_surface, patch};
+use super::volume::{Heights, Volume};
+use crate::error::{EditError, Result};
+use crate::grid::MAX_COORD;
+use crate::levelset::LevelSet;
+use crate::mesh::widened;
+use crate::run::RunOptions;
+
+/// Spacing of particles along the patch and across it, in voxels.
+const SPACING: f64 = 2.0;
+
+/// How far a corner may lie from the surface, as a part of the longest edge, and in voxels at least.
+const CORNER_REACH: f64 = 0.25;
+const LEAST_CORNER_REACH: f64 = 5.0;
+
+/// Largest patch and height, in voxels.
+const LARGEST: f64 = 4000.0;
+
+/// How far below the surface (or above it, if the texture goes down) the space goes on, in voxels beyond the half width of the band.
+const BEYOND: f64 = 2.0;
+
+/// How particles are distributed above a patch.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Parameterization {
+    /// Each follows the normal.
+    Conforming,
+    /// Each level has an even net of its own; the corners climb along directions (world space) if there are any.
+    LowDistortion(Option<[DVec3; 4]>),
+    /// The patch is carried along a curve through these points (world space), which begins at the middle of the patch. The height is its length.
+    Spline(Vec<DVec3>),
+}
+
+/// A patch of a surface with the space above it, and the map from (u, v, w) in 0..1³ into that.
+pub struct Patch {
+    pub(super) volume: Volume,
+    pub(super) cells: Cells,
+    /// Lengths of the edges p1p2 and p1p4 and the height, in voxels.
+    lengths: DVec3,
+    /// Whether w = 0 is on the surface; else w = 1 is.
+    pub(super) raised: bool,
+    /// How far the space goes on behind the surface, in voxels.
+    pub(super) depth: f64,
+}
+
+impl Patch {
+    /// Over the four-sided piece of the surface of `base` between four corners (world units), counter-clockwise seen from outside, which are brought to
+    /// the surface. The space is `height` world units high; if that is negative, it goes down.
+    pub fn between(
+        base: &LevelSet,
+        corners: [DVec3; 4],
+        height: f64,
+        parameterization: &Parameterization,
+        run: &RunOptions,
+    ) -> Result<Self> {
+        let transform = base.transform();
+        let said = corners.iter().fold(String::new(), |mut said, p| {
+            let _ = write!(said, "{}{},{},{}", if said.is_empty() { "" } else { " " }, p.x, p.y, p.z);
+            said
+        });
+        let refuse = |accepted: String| EditError::parameter(OPERATION, "corners", &said, accepted);
+        let corners = corners.map(|p| transform.world_to_index(p));
+        let longest = (0..4).map(|k| corners[k].distance(corners[(k + 1) % 4])).fold(0.0, f64::max);
+        if !(longest <= LARGEST) {
+            let most = LARGEST * base.voxel_size();
+            return Err(refuse(format!("corners at most {most} apart ({LARGEST} voxels)")));
+        }
+        let reach = (CORNER_REACH * longest).max(LEAST_CORNER_REACH);
+        let handed = transform.to_world().matrix3.determinant() < 0.0;
+        let corners = corners_on_surface(base, corners, reach, handed).map_err(refuse)?;
+        let space = Space::around(base, &corners, longest / 2.0, height, parameterization, run)?;
+        let net = patch(Level::new(&space.field, 0.0), corners, SPACING, None).ok_or_else(|| broken(OPERATION))?;
+        space.patch(net, parameterization, run)
+    }
+
+    /// Over a net of points on the surface of `base`.
+    pub fn over(
+        base: &LevelSet,
+        net: Net,
+        height: f64,
+        parameterization: &Parameterization,
+        run: &RunOptions,
+    ) -> Result<Self> {
+        Space::around(base, &net.points, 0.0, height, parameterization, run)?.patch(net, parameterization, run)
+    }
+
+    /// Distortion of the map from a texture of this patch's edge lengths and height.
+    pub fn distortion(&self) -> Distortion {
+        self.cells.distortion(self.lengths)
+    }
+
+    /// Lengths of the edges p1p2 and p1p4 and the height, in voxels.
+    pub fn lengths(&self) -> DVec3 {
+        self.lengths
+    }
+
+    /// The place in voxels of (u, v, w) in 0..1³: the semi-implicit map.
+    pub fn place(&self, uvw: DVec3) -> DVec3 {
+        self.volume.at(uvw)
+    }
+
+    /// (u, v, w) of a place in voxels, the exact inverse of [`place`](Self::place); `None` outside the space above the patch. w goes on a few
+    /// voxels beyond the surface.
+    pub fn find(&self, ijk: DVec3) -> Option<DVec3> {
+        self.cells.finder().find(ijk)
+    }
+
+    /// The particles, in voxels, with their (u, v, w), and the edges between them.
+    pub fn particles(&self) -> Particles {
+        let mut all = Particles::default();
+        for (net, &w) in self.volume.layers.iter().zip(&self.volume.levels) {
+            let first = all.places.len();
+            let [nu, nv] = net.counts;
+            for i in 0..=nu {
+                for j in 0..=nv {
+                    all.places.push((net.at(i, j), DVec3::new(i as f64 / nu as f64, j as f64 / nv as f64, w)));
+                    let here = first + i * (nv + 1) + j;
+                    all.edges.extend((j > 0).then(|| [here - 1, here].map(|k| k as u32)));
+                    all.edges.extend((i > 0).then(|| [here - (nv + 1), here].map(|k| k as u32)));
+                }
+            }
+        }
+        all
+    }
+}
+
+/// Particles and the edges of the nets that they make.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Particles {
+    /// Position in voxels and (u, v, w).
+    pub places: Vec<(DVec3, DVec3)>,
+    /// Pairs of particles.
+    pub edges: Vec<[u32; 2]>,
+}
+
+/// The distance field around a patch that is to be.
+struct Space {
+    field: LevelSet,
+    /// In voxels, negative downwards.
+    height: f64,
+    depth: f64,
+}
+
+impl Space {
+    /// Around `points` (in voxels) and as much more, as far as the height.
+    fn around(
+        base: &LevelSet,
+        points: &[DVec3],
+        more: f64,
+        height: f64,
+        parameterization: &Parameterization,
+        run: &RunOptions,
+    ) -> Result<Self> {
+        let (h, depth) = (base.voxel_size(), f64::from(base.half_width()) + BEYOND);
+        let along_curve = matches!(parameterization, Parameterization::Spline(_));
+        let voxels = if along_curve { depth } else { height / h };
+        if !(voxels.abs() >= 1.0 && voxels.abs() <= LARGEST) {
+            let accepted = format!("{h} to {} (1 to {LARGEST} voxels), or as much downwards", LARGEST * h);
+            return Err(EditError::parameter(OPERATION, "height", height, accepted));
+        }
+        let around = voxels.abs() + more + 8.0;
+        let lo = points.iter().copied().fold(DVec3::INFINITY, DVec3::min) - around;
+        let hi = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max) + around;
+        if !(lo.abs().max(hi.abs()).max_element() <= f64::from(MAX_COORD)) {
+            let accepted = "a place within 2^30 voxels of the origin";
+            return Err(EditError::parameter(OPERATION, "corners", format!("{lo} to {hi}, in voxels"), accepted));
+        }
+        let wanted = |first: IVec3, last: IVec3| first.as_dvec3().cmple(hi).all() && last.as_dvec3().cmpge(lo).all();
+        let field = widened(base, (voxels.abs().max(depth) + 3.0) as f32, wanted, run)?;
+        run.check(OPERATION)?;
+        Ok(Self { field, height: voxels, depth })
+    }
+
+    fn patch(self, net: Net, parameterization: &Parameterization, run: &RunOptions) -> Result<Patch> {
+        let Self { field, height, depth } = self;
+        let transform = *field.transform();
+        let [bottom, left] = net.edges();
+        let mut lengths = DVec3::new(bottom, left, height.abs());
+        let of = if height > 0.0 { Heights::raised } else { Heights::sunk };
+        let heights = of(height.abs(), depth, SPACING);
+        let volume = match parameterization {
+            Parameterization::Conforming => Volume::conforming(&field, net, &heights),
+            Parameterization::LowDistortion(directions) => {
+                let directions = directions.map(|d| d.map(|d| (transform.to_index().matrix3 * d).normalize_or_zero()));
+                Volume::low_distortion(&field, net, &heights.coarser(), SPACING, directions).ok_or_else(|| {
+                    let accepted =
+                        "a smaller height, or the conforming parameterization: a level above the patch ends or folds";
+                    EditError::parameter(OPERATION, "height", height * transform.voxel_size(), accepted)
+                })?
+            }
+            Parameterization::Spline(points) => {
+                let middle = net.bilinear(0.5, 0.5);
+                let normal = Level::new(&field, 0.0).probe().normal(middle).ok_or_else(|| broken(OPERATION))?;
+                let mut curve = vec![middle];
+                curve.extend(points.iter().map(|p| transform.world_to_index(*p)));
+                curve.dedup_by(|a, b| a.distance(*b) < 1.0);
+                let longest = curve.windows(2).map(|w| w[0].distance(w[1])).sum::<f64>();
+                if !(curve.len() >= 2 && longest <= LARGEST) {
+                    let accepted = format!("points that lead up to {LARGEST} voxels away from the patch");
+                    return Err(EditError::parameter(OPERATION, "spline", points.len(), accepted));
+                }
+                // It leaves the surface along the normal.
+                curve.insert(1, middle + normal * (curve[1].distance(middle) * UPRIGHT));
+                let (volume, length) = Volume::along_spline(&field, net, &curve, normal, depth, SPACING);
+                lengths.z = length;
+                volume
+            }
+        };
+        run.check(OPERATION)?;
+        let cells = Cells::new(&volume);
+        Ok(Patch { volume, cells, lengths, raised: height > 0.0, depth })
+    }
+}
+
+/// Part of the way to the first point of a spline along which it goes with the normal.
+const UPRIGHT: f64 = 0.25;
