@@ -319,9 +319,9 @@ mod tests {
             let report =
                 move_surface(&mut level_set, &Spring { radius: 12.4 }, bending, 2000, &mut control, &run).unwrap();
             assert_eq!(level_set.check(), []);
-            // 12.4 − R = 2β/R, the volume that of polygons, 0.6/R² of it less.
+            // 12.4 − R = 2β/R. The volume is that of polygons, 0.6/R² of it less: 0.017 of the radius.
             let r = radius(&level_set);
-            assert!((12.4 - r - 2.0 * bending / r).abs() < 0.02, "{bending}: {r} {report:?}");
+            assert!((12.4 - r - 2.0 * bending / r).abs() < 0.03, "{bending}: {r} {report:?}");
         }
     }
 }

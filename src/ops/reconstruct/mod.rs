@@ -10,7 +10,9 @@
 //! Ranges are low-passed to the size of a voxel first. The first surface is the zero set of Σ c μ w D, with what any map sees through outside and the rest
 //! inside; specks and bubbles are dropped. It then follows the flow. The window must be narrower than a third of the object, or maps of its far side interfere.
 //!
-//! Measured (tests): a torus of 9.4 voxels from six maps with noise of a fifth of that radius is met within 0.25 voxel RMS and its volume within 2 %.
+//! Measured (tests): a torus of 9.4 voxels from six maps with noise of a fifth of that radius is met within 0.14 voxel RMS and its volume within 1 %; without
+//! noise and prior within 0.12. The data term is looked up once a voxel, so that the force beside the surface does not vanish at rest: "nothing moves any
+//! more" means that its RMS has stopped falling.
 
 mod fit;
 mod forces;
