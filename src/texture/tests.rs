@@ -212,8 +212,10 @@ fn tiles_meet_without_gaps() {
         // Polygons that are moved meet face to face, with their rounded edges.
         let euler = if map == Map::SemiImplicit { measures.euler } else { 2 };
         assert_eq!((measures.components, measures.euler), (1, euler), "{map:?}");
-        // The outer edges are rounded by a part of a voxel.
-        assert!((measures.volume / (18.0 * 24.0 * 8.0) - 1.0).abs() < 0.05, "{map:?} {}", measures.volume);
+        // The outer edges are rounded by a part of a voxel; of moved polygons those of each tile.
+        let allowed = if map == Map::SemiImplicit { 0.08 } else { 0.05 };
+        let ratio = measures.volume / (18.0 * 24.0 * 8.0);
+        assert!((ratio - 1.0).abs() < allowed, "{map:?} {ratio}");
     }
 }
 

@@ -245,12 +245,11 @@ impl<'a> Solid<'a> {
             (true, true) => (uvw.z + self.push).max(self.rim.z),
             (true, false) => (uvw.z - self.push).min(1.0 - self.rim.z),
         };
-        let t = DVec3::new(self.repeated(uvw.x, 0), self.repeated(uvw.y, 1), w);
-        let at = self.texture.transform().world_to_index(self.lo + self.size * t);
-        let value = match self.sampling {
-            Sampling::Linear => f64::from(probe.0.trilinear(at)),
-            Sampling::Cubic => cubic(&mut probe.0, at),
-        };
+        let (u, v) = (self.repeated(uvw.x, 0), self.repeated(uvw.y, 1));
+        let [own, inner, face] = [0, 1, 2].map(|k| DVec3::new(u[k], v[k], w));
+        // By a face between tiles that the solid touches it goes on into the next tile: faces that meet are no gap. What ends before the face is one.
+        let touches = own != inner && self.value(probe, face) < ROUNDED * self.texture.voxel_size();
+        let value = self.value(probe, if touches { inner } else { own });
         let phi = value / self.stretch;
         if !roots || phi >= 0.0 {
             return phi;
@@ -264,14 +263,28 @@ impl<'a> Solid<'a> {
         phi
     }
 
-    /// The place in the texture of u or v: between two tiles, what is just inside of their faces, so that faces that meet are no gap.
-    fn repeated(&self, t: f64, axis: usize) -> f64 {
+    /// φ at a place of the texture's box, 0..1³.
+    fn value(&self, probe: &mut Probe, t: DVec3) -> f64 {
+        let at = self.texture.transform().world_to_index(self.lo + self.size * t);
+        match self.sampling {
+            Sampling::Linear => f64::from(probe.0.trilinear(at)),
+            Sampling::Cubic => cubic(&mut probe.0, at),
+        }
+    }
+
+    /// The place in the texture of u or v, that place kept away from the faces between tiles, and the one just inside of such a face if it is by one.
+    fn repeated(&self, t: f64, axis: usize) -> [f64; 3] {
         let n = self.tile[axis];
         let cell = (t * n).floor().clamp(0.0, n - 1.0);
-        let within = t * n - cell;
-        let low = if cell > 0.0 { self.rim[axis] } else { f64::NEG_INFINITY };
-        let high = if cell < n - 1.0 { 1.0 - self.rim[axis] } else { f64::INFINITY };
-        within.clamp(low, high)
+        let (own, rim) = (t * n - cell, self.rim[axis]);
+        let skin = (0.5 * self.texture.voxel_size() / self.size[axis]).min(rim);
+        if cell > 0.0 && own < rim {
+            [own, rim, skin]
+        } else if cell < n - 1.0 && own > 1.0 - rim {
+            [own, 1.0 - rim, 1.0 - skin]
+        } else {
+            [own; 3]
+        }
     }
 }
 
@@ -289,6 +302,9 @@ pub(super) fn catmull_rom(t: f64) -> [f64; 4] {
 
 /// How far the surface may lie below the particles' net, in voxels: as far a texture goes on behind it in any case.
 const SKIN: f64 = 1.5;
+
+/// What voxels round off the edges of a solid by, in those voxels.
+const ROUNDED: f64 = 0.3;
 
 /// How far inside of a face that goes on the texture is looked up, in voxels of the base: nearer, its distance would be lost between them.
 const RIM: f64 = 1.5;
