@@ -473,14 +473,17 @@ fn watching_runs_again_when_a_file_changes() {
 }
 
 /// Voxel sizes that keep this test short; the others run as they are.
-const COARSER: [(&str, &str); 8] = [
+const COARSER: [(&str, &str); 11] = [
     ("bars", "0.04"),
     ("bust", "2"),
     ("creature", "0.016"),
+    ("cube_to_torus", "0.04"),
     ("embossed_teapot", "0.6"),
     ("eye", "1.5"),
+    ("jet_to_dart", "0.03"),
     ("offset", "1"),
     ("smoothing_against_opening", "0.08"),
+    ("three_heads", "0.08"),
     ("winged_cow", "0.016"),
 ];
 

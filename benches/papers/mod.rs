@@ -152,7 +152,7 @@ fn blend(run: &RunOptions) -> Result<()> {
     let row = Row { name: "blend, 60 iterations", volume: [82, 48, 63], target: 0.1, paper: "98" };
     let column = shape("superellipsoid radii=32,15,110 exponents=0.1,1", run)?;
     let slab = shape("box size=260,200,60 center=0,0,-30 rotate=y,-35", run)?;
-    let parameters = json!({ "iterations": 60, "d_min": 7, "d_max": 9, "curvature_low": "0.04,0.06" });
+    let parameters = json!({ "iterations": 60, "d_min": 7, "d_max": 9, "curvature_low": [0.04, 0.06] });
     let times = ours("blend", parameters, &[&column, &slab], run)?;
     let united = find("csg")?.run(values(json!({})), vec![column.clone(), slab.clone()], run)?.level_set;
     let theirs = masked_flow(&united, "box size=82,48,63 soft=0.9,1", 60, run)?;

@@ -103,7 +103,7 @@ const CLOSED: f64 = REACHED / 4.0;
 const COURANT: f64 = 0.5;
 
 /// Travel of what changes the normal in a step, in voxels.
-const TRAVEL: f64 = 0.25;
+const TRAVEL: f64 = 0.4;
 
 /// Most parts of a step.
 const MOST_PARTS: f64 = 16.0;
@@ -119,7 +119,7 @@ const ASKEW: f64 = 0.1;
 const LONGEST_TIMED: f64 = 0.05;
 
 /// Longest step where only the end matters.
-const LONGEST_STEP: f64 = 0.25;
+const LONGEST_STEP: f64 = 0.5;
 
 /// Least half width, in voxels, of the band it works on: φ(p) is a distance within it.
 const BAND: f32 = 7.0;
@@ -140,7 +140,7 @@ const SIDEWAYS: f64 = 0.5;
 const DRAWN: f32 = 0.5;
 
 /// Steps without progress after which a flow is at rest.
-const PATIENCE: u32 = 12;
+const PATIENCE: u32 = 8;
 
 /// What counts as progress, in voxels: a fall of the largest gap, or of the mean distance of what is drawn from its targets.
 const PROGRESS: f64 = 0.01;
