@@ -21,6 +21,9 @@ use crate::run::RunOptions;
 /// Half width of the band of a texture that is looked up, in its voxels: it tells blocks of voxels without its surface.
 const BAND: f32 = 12.0;
 
+/// That of the band which is made of its polygons first.
+const NARROW: f32 = 3.0;
+
 /// Which map takes places to the texture, or the texture to places.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Map {
@@ -98,7 +101,11 @@ impl Source {
         }
         let made = match key {
             i32::MIN => with_half_width(&self.given, BAND.max(self.given.half_width()), run)?,
-            _ => level_set_of_mesh(self.mesh.clone(), &Transform::uniform(power.exp2()), BAND, run)?,
+            _ => {
+                // The band widened from the coarser polygons, which are fewer.
+                let narrow = level_set_of_mesh(self.mesh.clone(), &Transform::uniform(power.exp2()), NARROW, run)?;
+                with_half_width(&narrow, BAND, run)?
+            }
         };
         self.lattices.insert(key, made.clone());
         Ok(made)
@@ -149,14 +156,13 @@ pub fn warped(
     let (lo, size) = (bounds.0, (bounds.1 - bounds.0).max(DVec3::splat(f64::MIN_POSITIVE)));
     let transform = base.transform();
     let push = laying.push / patch.lengths().z;
-    let push = if patch.raised { -push } else { push };
     let [nu, nv] = laying.tile.map(|n| n.max(1));
     let mut all = TriangleMesh::default();
     for tile in 0..nu * nv {
         let (i, j) = (f64::from(tile / nv), f64::from(tile % nv));
         let place = |p: &DVec3| {
             let t = (*p - lo) / size;
-            let uvw = DVec3::new((t.x + i) / f64::from(nu), (t.y + j) / f64::from(nv), t.z + push);
+            let uvw = DVec3::new((t.x + i) / f64::from(nu), (t.y + j) / f64::from(nv), t.z - push);
             transform.index_to_world(patch.place(uvw))
         };
         let first = all.positions.len() as u32;
@@ -239,12 +245,8 @@ impl<'a> Solid<'a> {
     /// ψ of a voxel whose (u, v, w) are known, in voxels of the base; at most the distance.
     pub fn distance(&self, probe: &mut Probe, ijk: DVec3, uvw: DVec3) -> f64 {
         let roots = self.push > 0.0;
-        // The faces on the surface go on into it, or out of it: what is just inside of them.
-        let w = match (roots, self.raised) {
-            (false, _) => uvw.z,
-            (true, true) => (uvw.z + self.push).max(self.rim.z),
-            (true, false) => (uvw.z - self.push).min(1.0 - self.rim.z),
-        };
+        // The faces on the surface go on behind it: what is just inside of them.
+        let w = if roots { (uvw.z + self.push).max(self.rim.z) } else { uvw.z };
         let (u, v) = (self.repeated(uvw.x, 0), self.repeated(uvw.y, 1));
         let [own, inner, face] = [0, 1, 2].map(|k| DVec3::new(u[k], v[k], w));
         // By a face between tiles that the solid touches it goes on into the next tile: faces that meet are no gap. What ends before the face is one.
@@ -254,7 +256,7 @@ impl<'a> Solid<'a> {
         if !roots || phi >= 0.0 {
             return phi;
         }
-        let behind = if self.raised { -uvw.z * self.height } else { (uvw.z - 1.0) * self.height };
+        let behind = -uvw.z * self.height;
         let phi = phi.max(behind - self.depth);
         if self.raised && behind > SKIN {
             // Not out of the other side of a thin wall.
