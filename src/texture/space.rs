@@ -25,7 +25,7 @@ const LEAST_CORNER_REACH: f64 = 5.0;
 /// Largest patch and height, in voxels.
 const LARGEST: f64 = 4000.0;
 
-/// How far below the surface (or above it, if the texture goes down) the space goes on, in voxels beyond the half width of the band.
+/// How far below the surface (or above it, if the height goes down) the space goes on, in voxels beyond the half width of the band.
 const BEYOND: f64 = 2.0;
 
 /// How particles are distributed above a patch.
@@ -45,7 +45,7 @@ pub struct Patch {
     pub(super) cells: Cells,
     /// Lengths of the edges p1p2 and p1p4 and the height, in voxels.
     lengths: DVec3,
-    /// Whether w = 0 is on the surface; else w = 1 is.
+    /// Whether the space is outside of the surface.
     pub(super) raised: bool,
     /// How far the space goes on behind the surface, in voxels.
     pub(super) depth: f64,
