@@ -10,7 +10,7 @@ use super::{FrameSpacing, Morph, NAME};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{level_set_to_mesh, onto_lattice};
-use crate::ops::Summary;
+use crate::ops::{Operator, Summary};
 use crate::run::RunOptions;
 
 /// Ratio of sizes from which on different units are suspected.
