@@ -7,7 +7,7 @@ use vdb_edit::LevelSet;
 use vdb_edit::grid::{Transform, offset_to_local};
 use vdb_edit::levelset::{CurvatureKind, curvature};
 use vdb_edit::mesh::{Rebuild, rebuild};
-use vdb_edit::ops::blend::{Blend, BlendMethod, Blended, blend};
+use vdb_edit::ops::blend::{Blend, BlendMethod, BlendNear, Blended, blend};
 use vdb_edit::ops::csg::{CsgOperation, csg};
 use vdb_edit::ops::fillet::{Fillet, fillet};
 use vdb_edit::ops::sharpen::{Sharpen, sharpen};
@@ -250,10 +250,12 @@ fn a_blend_has_the_volumes_and_the_profile_of_the_reference() {
         // The reference renormalises every fifth step and by sweeping.
         assert!((found.volume_added / expected - 1.0).abs() < 0.06, "{name} {time}: {found:?} {expected}");
     }
-    // Inwards only, against the sense of a fillet: the volume falls and the crease stays.
+    // Inwards only, against the sense of a fillet: the volume falls and the crease stays. The reference states −299, of which a third is the
+    // shift of the surface by its own sweeping: with one every 30, 10, 5 and 1 steps it has −210, −282, −299 and −592, without any −192, and with
+    // WENO5 renormalisation every 5 steps and every step −189 and −212.
     let (outcome, found) = blended(&for_time(54.0, direction(Direction::Remove)));
     let least = least_mean_curvature(&outcome.level_set, 6.0);
-    assert!(found.volume_added < -150.0 && least < -0.5, "{found:?} {least}");
+    assert!((found.volume_added + 200.0).abs() < 15.0 && least < -0.5, "{found:?} {least}");
     let (outcome, found) = blended(&for_time(54.0, CurvatureOptions::default()));
     let least = least_mean_curvature(&outcome.level_set, 6.0);
     assert!((least + 0.069).abs() < 0.015, "{least}");
@@ -343,7 +345,9 @@ fn surfaces_that_do_not_meet_are_not_joined() {
 fn fillets_and_rounds_stop_at_their_radius() {
     // In a region, too: held at its rim.
     let middle = RegionSpecs(vec!["cylinder radius=20 height=20".into()]);
-    for (radius, region) in [(4.0, RegionSpecs::default()), (8.0, RegionSpecs::default()), (8.0, middle)] {
+    for (radius, region) in
+        [(2.0, RegionSpecs::default()), (4.0, RegionSpecs::default()), (10.0, RegionSpecs::default()), (8.0, middle)]
+    {
         let evolution = EvolutionOptions { region, ..EvolutionOptions::default() };
         let params = Fillet { radius: Some(WorldLength::new(radius)), evolution, ..Fillet::default() };
         for rounds in [false, true] {
@@ -353,13 +357,33 @@ fn fillets_and_rounds_stop_at_their_radius() {
             let expected = (2f64.sqrt() - 1.0) * radius * if rounds { -1.0 } else { 1.0 };
             let found = retreat(&level_set, expected);
             assert_eq!(level_set.check(), []);
-            // The limit is approached ever more slowly: 92 % of the way at 4 voxels when the steps end, and never past it.
-            assert!(
-                report.steps > 0 && (0.75..1.05).contains(&(found / expected)),
-                "{radius} {rounds}: {found} {report:?}"
-            );
+            assert_eq!(report.stopped, StopReason::AtRest);
+            // The polygons of the second offset lie up to 3/8·h²/R off the first one's.
+            assert!((found - expected).abs() < 0.1, "{radius} {rounds}: {found} {expected}");
         }
     }
+}
+
+#[test]
+fn a_gap_is_no_edge() {
+    // Two plates 3 voxels apart, and a post on the upper one: a ball of 4 voxels does not fit between the plates either.
+    let run = RunOptions::default();
+    let solid = |centre: DVec3, half: DVec3| sampled(36, move |p: DVec3| box_distance(p - centre, half));
+    let plate = |z: f64| solid(DVec3::Z * z, DVec3::new(28.0, 28.0, 4.0));
+    let post = solid(DVec3::Z * 14.0, DVec3::new(6.0, 6.0, 10.0));
+    let before = csg(&plate(-5.5), &[&plate(5.5), &post], CsgOperation::Union, &run).unwrap();
+    let mut after = before.clone();
+    let params = Fillet { radius: Some(WorldLength::new(4.0)), ..Fillet::default() };
+    assert_eq!(fillet(&mut after, &params, &run).unwrap().stopped, StopReason::AtRest);
+    assert_eq!(after.check(), []);
+    let mut sampler = after.sampler();
+    // At its mouth distances are bounds: that of the ball which was taken back is still felt.
+    for x in 10..26 {
+        let between = sampler.trilinear(DVec3::new(f64::from(x), f64::from(x) / 2.0, 0.0));
+        assert!((between - 1.5).abs() < 0.01, "{x}: {between}");
+    }
+    let depth = on_ray(&after, DVec3::new(6.0, 0.0, 9.5), DVec3::new(1.0, 0.0, 1.0).normalize(), 1.6);
+    assert!((depth - (2f64.sqrt() - 1.0) * 4.0).abs() < 0.1, "{depth}");
 }
 
 #[test]
@@ -524,6 +548,14 @@ fn the_anisotropic_gaussian_fills_the_edge_and_nothing_else() {
         }
     }
     assert!(kept > 1000);
+    // Near both surfaces, within four voxels of each: 2.83 along the bisector and farther than the filter reaches, so the same edge.
+    let both = Blend { near: BlendNear::Surfaces, ..params.clone() };
+    let (outcome, _) = blend(&a, &b, &both, &run).unwrap();
+    assert_eq!(outcome.level_set.check(), []);
+    let depth = on_ray(&outcome.level_set, DVec3::new(8.0, 8.0, 0.0), DVec3::new(1.0, 1.0, 0.0).normalize(), 1.8);
+    assert!((depth - 1.795).abs() < 0.1, "{depth}");
+    let refused = Blend { near: BlendNear::Surfaces, ..Blend::default() }.validate().unwrap_err();
+    assert!(refused.to_string().contains("method gaussian"), "{refused}");
     // Of a difference it removes.
     let cut = Blend { operation: CsgOperation::Difference, ..params.clone() };
     assert!(blend(&a, &b, &cut, &run).unwrap().1.volume_added < 0.0);

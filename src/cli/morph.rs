@@ -57,6 +57,12 @@ fn build(command: Command) -> Command {
                     .action(ArgAction::SetTrue)
                     .help("Leave out frames whose files are there"),
             )
+            .arg(
+                args::path("animation")
+                    .long("animation")
+                    .value_name("FILE.png")
+                    .help("All frames as an animated PNG, 24 a second"),
+            )
             .arg(args::path("plot").long("plot").value_name("FILE.png").help(
                 "A plot of the frames: RMS distance (blue) and shared volume (orange), each from 0 to its largest",
             ));

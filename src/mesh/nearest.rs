@@ -20,7 +20,7 @@ use super::cluster::{Candidates, Clusters, Nearby, Query, SLACK};
 use crate::error::Result;
 use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues};
 use crate::levelset::BYTES_A_LEAF;
-use crate::levelset::isosurface::IsoSurface;
+use crate::levelset::isosurface::{IsoSurface, SHARP_TRIANGLES};
 use crate::run::RunOptions;
 use crate::stencil::simd::dispatch;
 
@@ -41,6 +41,8 @@ pub(super) struct Band {
     pub voxel_size: f64,
     /// |φ| beyond the band, in world units.
     pub background: f32,
+    /// Whether the surface at an offset is that of the field's sharp edges, not of the polygons that cut them off.
+    pub sharp: bool,
 }
 
 impl Band {
@@ -221,7 +223,8 @@ impl Search<'_> {
             if self.inside(bounds.0) { self.band.side(-hi, -lo) } else { self.band.side(lo, hi) }
         };
         near.retain(|(_, gap)| side == Side::Near && *gap <= *farthest);
-        near.iter().map(|&(place, _)| u64::from(self.surface.leaves()[place].triangles)).sum()
+        let polygons: u64 = near.iter().map(|&(place, _)| u64::from(self.surface.leaves()[place].triangles)).sum();
+        if self.band.sharp { polygons * (1 + SHARP_TRIANGLES) } else { polygons }
     }
 
     /// Adds the leaves of a tile that have voxels in the band, from the triangles of what was collected.
@@ -239,6 +242,14 @@ impl Search<'_> {
             self.surface.for_each_triangle(leaf, wanted, |cell, corners| {
                 clusters.push((from + cell - bounds.0).as_vec3(), corners);
             });
+            if self.band.sharp {
+                // Outwards the edges of the inside count, inwards those of the outside.
+                let side = if self.band.offset >= 0.0 { 1.0 } else { -1.0 };
+                let of = (side, self.band.voxel_size.recip() as f32);
+                self.surface.for_each_sharp_triangle(leaf, of, wanted, |cell, corners| {
+                    clusters.push((from + cell - bounds.0).as_vec3(), corners);
+                });
+            }
         }
         clusters.finish();
         let block = Block { origin: IVec3::ZERO, edge: TILE, nearest: 0 };

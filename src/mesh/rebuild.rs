@@ -34,12 +34,15 @@ pub struct Rebuild {
     pub iso: f32,
     /// Distance (world units, positive outwards) of the new surface from that one.
     pub offset: f64,
+    /// At an offset: keep the field's sharp edges on the side that the surface moves to, which its polygons cut off. For fields that are distances; up to
+    /// 64 voxels.
+    pub sharp: bool,
 }
 
 impl Rebuild {
     /// The same surface with a band of `half_width` voxels.
     pub fn band(half_width: f32) -> Self {
-        Self { half_width, iso: 0.0, offset: 0.0 }
+        Self { half_width, iso: 0.0, offset: 0.0, sharp: false }
     }
 }
 
@@ -47,7 +50,7 @@ impl Rebuild {
 pub fn rebuild(level_set: &LevelSet, what: &Rebuild, run: &RunOptions) -> Result<LevelSet> {
     let transform = *level_set.transform();
     let voxel_size = transform.voxel_size();
-    let Rebuild { half_width, iso, offset } = *what;
+    let Rebuild { half_width, iso, offset, sharp } = *what;
     if iso.is_nan() || iso.abs() >= level_set.background() {
         return Err(EditError::parameter(
             OPERATION,
@@ -73,7 +76,8 @@ pub fn rebuild(level_set: &LevelSet, what: &Rebuild, run: &RunOptions) -> Result
         return from_tree(level_set, what, bounds, run);
     }
     let background = background(half_width, &transform);
-    let band = Band { offset, half_width: f64::from(half_width), voxel_size, background };
+    let sharp = sharp && offset != 0.0;
+    let band = Band { offset, half_width: f64::from(half_width), voxel_size, background, sharp };
     let leaves = leaves_of_band(OPERATION, &surface, level_set.grid(), iso, band, |_, _| true, run)?;
     Ok(LevelSet::new(grid_of_parts(background, &leaves), transform))
 }
@@ -140,14 +144,15 @@ pub(crate) fn rebuilt_leaves(
     let transform = level_set.transform();
     let background = background(half_width, transform);
     let surface = surface_of(level_set, 0.0, OPERATION, run)?;
-    let band = Band { offset: 0.0, half_width: half_width.into(), voxel_size: transform.voxel_size(), background };
+    let (half, voxel_size) = (f64::from(half_width), transform.voxel_size());
+    let band = Band { offset: 0.0, half_width: half, voxel_size, background, sharp: false };
     leaves_of_band(OPERATION, &surface, level_set.grid(), 0.0, band, wanted, run)
 }
 
 /// The same by looking up the closest triangle in a tree, voxel by voxel.
 fn from_tree(level_set: &LevelSet, what: &Rebuild, bounds: (IVec3, IVec3), run: &RunOptions) -> Result<LevelSet> {
     let transform = *level_set.transform();
-    let Rebuild { half_width, iso, offset } = *what;
+    let Rebuild { half_width, iso, offset, .. } = *what;
     let offset = offset / transform.voxel_size();
     // Found out before the search: no surface at this distance outwards of anything has less area than a ball of that radius.
     let area = 4.0 * std::f64::consts::PI * offset.max(0.0).powi(2);

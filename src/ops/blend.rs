@@ -8,7 +8,8 @@
 //! of 90° rests as an arc of radius 1/(2γ) under `curvature`, 1/γ under `fillet`, γ the lower limit, if d_max is at least that far; otherwise
 //! the region shapes it. The limits of `curvature` are those of the paper; those of `fillet` are set for a radius of d_min.
 //!
-//! `gaussian` takes an anisotropic Gaussian ([`filter_anisotropic`]) instead of a flow, whose kernels fade with D_p.
+//! `gaussian` takes an anisotropic Gaussian ([`filter_anisotropic`]) instead of a flow, whose kernels fade with D_p, or, near `surfaces`, with the distance to both
+//! surfaces: Π (1 − P(|φᵢ|; d_min, d_max)), the region of the thesis of 2006.
 //!
 //! d is measured to the curve and not to both surfaces, so that surfaces that come near each other without meeting are not
 //! joined. Beyond d_max the result has the bits of `csg`. Where faces coincide the curve is a patch: the region is then wider, and rests as it is flat.
@@ -25,8 +26,9 @@ use super::registry::{Arity, Operator, Outcome, Summary};
 use super::solver::{EvolutionOptions, SMOOTHING, evolved};
 use crate::error::{EditError, Result};
 use crate::levelset::{CurvatureKind, LevelSet, curvature_of, curve_length};
+use crate::mesh::with_half_width;
 use crate::pde::{AnisotropicGaussian, CurvatureFlow, CutOff, Direction, FlowCurvature, filter_anisotropic};
-use crate::region::{Combined, Near, Region, RegionWeights};
+use crate::region::{Combined, Near, NearSurface, Region, RegionWeights};
 use crate::run::RunOptions;
 
 words! {
@@ -41,6 +43,16 @@ words! {
     }
 }
 
+words! {
+    /// What a blend acts near.
+    BlendNear {
+        /// The curve where the surfaces meet.
+        Curve = "curve",
+        /// Both surfaces at once, whether they meet or not.
+        Surfaces = "surfaces",
+    }
+}
+
 /// Unite, subtract or intersect level sets and blend the edge where they meet.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
@@ -50,10 +62,13 @@ pub struct Blend {
     /// How to blend: `curvature` by mean curvature or what `curvature` says, `fillet` by the concave curvatures alone (the convex ones where material is removed),
     /// `gaussian` by one pass, or as many as `iterations` says, of a Gaussian along the surface, which is far faster.
     pub method: BlendMethod,
+    /// What it acts near: the `curve` where the surfaces meet; or, of `gaussian`, both `surfaces` (the region of the thesis of 2006), which also joins
+    /// surfaces that come within `d_max` of each other without meeting.
+    pub near: BlendNear,
     /// Distance from the curve within which it acts in full; 7 voxels if not given, of `gaussian` half of `d_max`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub d_min: Option<VoxelLength>,
-    /// Distance from the curve beyond which nothing changes; 9 voxels if not given, of `gaussian` 3 s₂.
+    /// Distance from the curve beyond which nothing changes; 9 voxels if not given, of `gaussian` 3 s₂, or 4 voxels from both surfaces.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub d_max: Option<VoxelLength>,
     /// Of `gaussian`: standard deviations along the normal and along the surface in voxels, the first not larger; 1.5,2.25 if not given. A right-angled edge is
@@ -74,6 +89,7 @@ impl Default for Blend {
         Self {
             operation: CsgOperation::Union,
             method: BlendMethod::Curvature,
+            near: BlendNear::Curve,
             d_min: None,
             d_max: None,
             sigma: None,
@@ -87,6 +103,9 @@ impl Default for Blend {
 const LOW: [f64; 2] = [0.04, 0.06];
 /// The upper of the lower limits over the lower one, there.
 const RAMP: f64 = 1.5;
+
+/// Voxels from both surfaces up to which the thesis filters.
+const BAND: f64 = 4.0;
 
 /// Steps in which a blend spreads to a distance, over the square of the distance in voxels: mean curvature flow reaches √(2t) or so, and
 /// 162 steps for 9 voxels are the 54 units of time after which the cylinder on a slab of the tests hardly changes.
@@ -131,6 +150,9 @@ impl Operator for Blend {
                 return Err(EditError::parameter(Self::NAME, "sigma", format!("{a},{b}"), accepted));
             }
             _ => {}
+        }
+        if self.near == BlendNear::Surfaces && self.method != BlendMethod::Gaussian {
+            return Err(EditError::parameter(Self::NAME, "near", "surfaces", "curve, or the method gaussian"));
         }
         if self.method == BlendMethod::Fillet {
             let accepted =
@@ -189,7 +211,11 @@ impl Blend {
         match self.gaussian() {
             None => [world(self.d_min, 7.0), world(self.d_max, 9.0)],
             Some(gaussian) => {
-                let most = world(self.d_max, 3.0 * f64::from(gaussian.sigma[1]));
+                let most = match self.near {
+                    BlendNear::Curve => 3.0 * f64::from(gaussian.sigma[1]),
+                    BlendNear::Surfaces => BAND,
+                };
+                let most = world(self.d_max, most);
                 [self.d_min.map_or(most / 2.0, |d| d.world(voxel_size)), most]
             }
         }
@@ -243,7 +269,7 @@ pub fn blend(first: &LevelSet, second: &LevelSet, params: &Blend, run: &RunOptio
     let joined = csg(first, &[second], params.operation, run)?;
     let voxel_size = joined.voxel_size();
     let curve = first.intersection_curve(second);
-    if curve.is_empty() {
+    if curve.is_empty() && params.near == BlendNear::Curve {
         let warning = "the surfaces do not meet: the result is that of `csg`, nothing was blended".into();
         let summary = Summary { warnings: vec![warning], ..Summary::default() };
         return Ok((Outcome { level_set: joined, summary }, Blended::default()));
@@ -253,7 +279,16 @@ pub fn blend(first: &LevelSet, second: &LevelSet, params: &Blend, run: &RunOptio
         let [low, high] = reach.map(|d| VoxelLength::new(d / voxel_size));
         return Err(EditError::parameter(Blend::NAME, "d_min", low, format!("at most d_max, {high}")));
     }
-    let mut region: Box<dyn Region> = Box::new(Near::new(&curve, reach)?);
+    let mut region: Box<dyn Region> = match params.near {
+        BlendNear::Curve => Box::new(Near::new(&curve, reach)?),
+        BlendNear::Surfaces => {
+            let near = |level_set: &LevelSet| -> Result<Box<dyn Region>> {
+                let wide = with_half_width(level_set, (reach[1] / voxel_size) as f32 + 1.0, run)?;
+                Ok(Box::new(NearSurface::new(wide, reach)))
+            };
+            Box::new(Combined::All(vec![near(first)?, near(second)?]))
+        }
+    };
     if let Some(further) = params.evolution.region.on(&joined, run)? {
         region = Box::new(Combined::All(vec![region, further]));
     }

@@ -37,11 +37,8 @@ impl Operator for RebuildDistance {
 
     fn apply(&self, mut inputs: Vec<LevelSet>, run: &RunOptions) -> Result<Outcome> {
         let input = inputs.remove(0);
-        let what = mesh::Rebuild {
-            half_width: self.half_width.unwrap_or(input.half_width()),
-            iso: self.iso.world(input.voxel_size()) as f32,
-            offset: 0.0,
-        };
+        let iso = self.iso.world(input.voxel_size()) as f32;
+        let what = mesh::Rebuild { iso, ..mesh::Rebuild::band(self.half_width.unwrap_or(input.half_width())) };
         Ok(mesh::rebuild(&input, &what, run)?.into())
     }
 }

@@ -18,6 +18,7 @@ pub mod morphology;
 mod params;
 pub mod reconstruct;
 mod registry;
+mod rolling;
 pub mod segment;
 mod sequence;
 pub mod shape;

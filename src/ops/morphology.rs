@@ -25,7 +25,7 @@ use crate::run::RunOptions;
 
 /// Moves the surface by `distance` (world units, positive outwards); the band keeps its half width.
 pub fn offset(level_set: &LevelSet, distance: f64, run: &RunOptions) -> Result<LevelSet> {
-    rebuild(level_set, &Rebuild { offset: distance, ..Rebuild::band(level_set.half_width()) }, run)
+    rebuild(level_set, &Rebuild { offset: distance, sharp: true, ..Rebuild::band(level_set.half_width()) }, run)
 }
 
 /// Refuses a length that cannot be moved by.
@@ -240,8 +240,9 @@ mod tests {
         let distance = WorldLength::new(w * 0.5);
         let opened = apply(&|| Open { distance, ..Open::default() }.apply(vec![cube.clone()], &run));
         let closed = apply(&|| Close { distance, ..Close::default() }.apply(vec![cube.clone()], &run));
-        // The polygonised box loses up to half a voxel at its edges, and no more than that elsewhere.
-        assert!(worst(&opened, |p| box_distance(p, half - w) - w) < 0.6);
+        // Of the eroded box, the sharp edges are kept.
+        let error = worst(&opened, |p| box_distance(p, half - w) - w);
+        assert!(error < 0.02, "{error}");
         let s: f64 = 2.0 * (16.3 - w);
         let volume = s.powi(3)
             + 6.0 * s * s * w
@@ -251,9 +252,9 @@ mod tests {
         // A corner retreats by (√3 − 1) w along its diagonal, 3.660 voxels.
         let corner = half.length() - (3f64.sqrt() - 1.0) * w;
         let at_corner = f64::from(opened.sampler().trilinear(DVec3::ONE.normalize() * corner)) / 0.5;
-        assert!(at_corner.abs() < 0.6, "{at_corner}");
-        // The polygons cut the twelve edges of the eroded box off at up to half a voxel, and the dilation carries that outwards.
-        assert!((measured / volume - 1.0).abs() < 0.015, "{measured} {volume}");
+        assert!(at_corner.abs() < 0.05, "{at_corner}");
+        // The volume is that of its polygons, which lie up to 3/8·h²/w inside the rounded edges and corners.
+        assert!((measured / volume - 1.0).abs() < 0.003, "{measured} {volume}");
         let before = cube.measure(&run).unwrap().volume;
         assert!((closed.measure(&run).unwrap().volume / before - 1.0).abs() < 0.01);
     }
@@ -273,8 +274,7 @@ mod tests {
         // What stays of the bar is the cap of a ball that leans out of its root: to 12 − √(3² − 2.2²) + 3.
         let tip = 15.0 - (9.0f64 - 2.2 * 2.2).sqrt();
         let at_tip = f64::from(opened.sampler().trilinear(DVec3::new(tip, 0.0, 0.0))) / 0.5;
-        // The polygons fill the rim of the hole by up to half a voxel each way; the tip moves by that and by 2.2 / 2.04 of it.
-        assert!(at_tip.abs() < 1.05, "{at_tip}");
+        assert!(at_tip.abs() < 0.05, "{at_tip}");
         let gap = level_set(40, |p| {
             box_distance(p - DVec3::new(0.0, 0.0, 12.0), DVec3::splat(10.0))
                 .min(box_distance(p + DVec3::new(0.0, 0.0, 12.0), DVec3::splat(10.0)))
@@ -286,8 +286,7 @@ mod tests {
         // Around the waist the ball of 3 that touches both edges sinks in by 3 − √(3² − 2²).
         let waist = 7.0 + 5f64.sqrt();
         let at_waist = f64::from(closed.sampler().trilinear(DVec3::new(waist, 0.0, 0.0))) / 0.5;
-        // The polygons cut the edges by up to half a voxel each way.
-        assert!(at_waist.abs() < 1.0, "{at_waist}");
+        assert!(at_waist.abs() < 0.05, "{at_waist}");
     }
 
     /// Morphology in a region: name, parameters and what it should do to the far half of a body.
@@ -410,11 +409,12 @@ mod tests {
             }
             assert!(moved > 100, "the edge is rounded: {moved}");
             let mut again = twice.sampler();
-            // Between the two steps the rim is sharp, and the polygons cut it.
+            // The closing is idempotent to 0.06. The second opening begins at the polygons of a rounded edge of 3 voxels, 3/8·h²/3 inside it: planes of a few
+            // cells of the eroded rim no longer meet, and these keep the polygons' cut (0.56 measured, at single voxels).
             let beside: Vec<_> = once.band_voxels().into_iter().filter(|(_, value)| value.abs() < 0.5).collect();
             let difference = |(ijk, value): &(IVec3, f32)| f64::from(again.voxel(*ijk) - value).abs() / 0.5;
             let most = beside.iter().map(difference).fold(0.0, f64::max);
-            assert!(most < 0.2, "{open}: {most}");
+            assert!(most < if open { 0.6 } else { 0.1 }, "{open}: {most}");
         }
     }
 

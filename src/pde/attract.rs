@@ -16,7 +16,7 @@
 //! > ∂(F|∇φ|)/∂∇φ = F n + C'(γ)|φ(p)| (u − (u·n) n),
 //!
 //! towards the target, and ten times faster than the surface moves. Steps too long for that, and central normals, break up flanks into pits: n is read
-//! a little upwind, and an Euler step lasts no longer than a quarter of a voxel of that travel. |∇φ| is Godunov's of the first order. The band is tracked
+//! a little upwind, and an Euler step lasts no longer than 0.4 voxels of that travel. |∇φ| is Godunov's of the first order. The band is tracked
 //! after half a voxel of motion, and what renormalisation then changes next to the surface is taken back: it wears down tips.
 //!
 //! Whatever faces a target would be drawn, at any distance, the other side of a solid among it. So γ is also bounded by what it would be if the

@@ -1,8 +1,8 @@
-//! Regions given by fields: inside a level set, a painted volume, a component of the level set itself.
+//! Regions given by fields: inside a level set, near one, a painted volume, a component of the level set itself.
 
 use glam::DVec3;
 
-use super::{Region, ramp};
+use super::{Region, ramp, ramp_between};
 use crate::grid::Volume;
 use crate::levelset::{Components, LevelSet};
 
@@ -26,6 +26,31 @@ impl Region for Inside {
     fn weight(&self, xyz: DVec3) -> f32 {
         let phi = self.level_set.sampler().trilinear(self.level_set.transform().world_to_index(xyz));
         ramp(f64::from(-phi) / self.depth) as f32
+    }
+
+    fn bounds(&self) -> Option<(DVec3, DVec3)> {
+        Some(self.level_set.world_bounds().unwrap_or((DVec3::ZERO, DVec3::ZERO)))
+    }
+}
+
+/// Both sides of a surface: α = 1 − P(|φ|; d_min, d_max).
+pub struct NearSurface {
+    level_set: LevelSet,
+    reach: [f64; 2],
+}
+
+impl NearSurface {
+    /// Full within `reach[0]` of the surface, nothing beyond `reach[1]` (world units), which the band has to reach.
+    pub fn new(level_set: LevelSet, reach: [f64; 2]) -> Self {
+        let band = f64::from(level_set.background());
+        Self { level_set, reach: reach.map(|d| d.min(band)) }
+    }
+}
+
+impl Region for NearSurface {
+    fn weight(&self, xyz: DVec3) -> f32 {
+        let phi = self.level_set.sampler().trilinear(self.level_set.transform().world_to_index(xyz));
+        (1.0 - ramp_between(f64::from(phi).abs(), self.reach[0], self.reach[1])) as f32
     }
 
     fn bounds(&self) -> Option<(DVec3, DVec3)> {

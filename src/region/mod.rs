@@ -13,7 +13,7 @@ mod weights;
 
 use glam::DVec3;
 
-pub use field::{Inside, Painted, Part};
+pub use field::{Inside, NearSurface, Painted, Part};
 pub(crate) use files::volume as read_volume;
 pub use near::Near;
 pub use plan::RegionPlan;
