@@ -11,9 +11,9 @@ use rustc_hash::FxHashMap;
 
 use super::OPERATION;
 use super::space::Patch;
-use super::wrap::{Made, Solid, block, catmull_rom, radius};
+use super::wrap::{Leaves, Made, Solid, block, catmull_rom, radius};
 use crate::error::{EditError, Result};
-use crate::grid::{LEAF_DIM, LeafMask, LeafValues, leaf_origin};
+use crate::grid::{LEAF_DIM, leaf_origin};
 use crate::rbf::{Basis, Interpolant};
 use crate::run::RunOptions;
 
@@ -99,12 +99,7 @@ impl<'a> Implicit<'a> {
     }
 
     /// The leaves near the texture's surface, and how often a sum over all particles was taken.
-    pub fn leaves(
-        &self,
-        solid: &Solid,
-        leaves: Vec<IVec3>,
-        run: &RunOptions,
-    ) -> Result<(Vec<(IVec3, LeafValues, LeafMask)>, u64)> {
+    pub fn leaves(&self, solid: &Solid, leaves: Vec<IVec3>, run: &RunOptions) -> Result<(Leaves, u64)> {
         let mut sums = 0;
         let mut edge = LEAF_DIM;
         while edge > 2 && f64::from(edge) > NODES * self.spacing {

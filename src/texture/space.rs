@@ -69,7 +69,7 @@ impl Patch {
         let refuse = |accepted: String| EditError::parameter(OPERATION, "corners", &said, accepted);
         let corners = corners.map(|p| transform.world_to_index(p));
         let longest = (0..4).map(|k| corners[k].distance(corners[(k + 1) % 4])).fold(0.0, f64::max);
-        if !(longest <= LARGEST) {
+        if !longest.is_finite() || longest > LARGEST {
             let most = LARGEST * base.voxel_size();
             return Err(refuse(format!("corners at most {most} apart ({LARGEST} voxels)")));
         }
@@ -169,7 +169,8 @@ impl Space {
         let around = voxels.abs() + more + 8.0;
         let lo = points.iter().copied().fold(DVec3::INFINITY, DVec3::min) - around;
         let hi = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max) + around;
-        if !(lo.abs().max(hi.abs()).max_element() <= f64::from(MAX_COORD)) {
+        let farthest = lo.abs().max(hi.abs()).max_element();
+        if !farthest.is_finite() || farthest > f64::from(MAX_COORD) {
             let accepted = "a place within 2^30 voxels of the origin";
             return Err(EditError::parameter(OPERATION, "corners", format!("{lo} to {hi}, in voxels"), accepted));
         }

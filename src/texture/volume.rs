@@ -67,7 +67,12 @@ impl Heights {
         let thinned = |levels: Vec<f64>| {
             let keep = levels.len().div_ceil(MOST_NETS).max(1);
             let last = levels.len();
-            levels.into_iter().enumerate().filter(|(i, _)| (last - 1 - i) % keep == 0).map(|(_, c)| c).collect()
+            levels
+                .into_iter()
+                .enumerate()
+                .filter(|(i, _)| (last - 1 - i).is_multiple_of(keep))
+                .map(|(_, c)| c)
+                .collect()
         };
         Self { below: thinned(self.below), above: thinned(self.above), texture: self.texture }
     }
@@ -247,7 +252,7 @@ fn climb(field: &LevelSet, from: DVec3, levels: &[f64], direction: Option<DVec3>
     let mut path = Vec::with_capacity(levels.len());
     let (mut x, mut c) = (from, 0.0);
     for &end in levels {
-        let steps = ((end - c) as f64).abs().div_euclid(STEP) as usize + 1;
+        let steps = (end - c).abs().div_euclid(STEP) as usize + 1;
         let step = (end - c) / steps as f64;
         for _ in 0..steps {
             c += step;

@@ -313,7 +313,8 @@ const RIM: f64 = 1.5;
 
 /// φ between voxels by Catmull and Rom's splines along each axis.
 fn cubic(sampler: &mut Sampler, ijk: DVec3) -> f64 {
-    if !(ijk.abs().max_element() < f64::from(MAX_COORD - 4)) {
+    let is_far = !ijk.is_finite() || ijk.abs().max_element() > f64::from(MAX_COORD - 4);
+    if is_far {
         return f64::from(sampler.trilinear(ijk));
     }
     let base = ijk.floor();
@@ -376,7 +377,8 @@ pub(super) fn block(edge: i32) -> impl Iterator<Item = IVec3> {
     (0..edge.pow(3)).map(move |i| IVec3::new(i / (edge * edge), i / edge % edge, i % edge))
 }
 
-type Leaves = Vec<(IVec3, LeafValues, LeafMask)>;
+/// Leaves of a grid: origin, values, which are active.
+pub(super) type Leaves = Vec<(IVec3, LeafValues, LeafMask)>;
 
 /// Blocks in which a leaf is looked at first.
 const BLOCK: i32 = 4;
