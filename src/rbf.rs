@@ -206,6 +206,32 @@ mod tests {
     }
 
     #[test]
+    fn residuals_are_those_of_the_reference() {
+        // 9 × 9 × 4 particles over a cap of radius 3, which waves by 0.02.
+        let mut points = Vec::new();
+        let mut values = Vec::new();
+        for k in 0..4 {
+            for i in 0..9 {
+                for j in 0..9 {
+                    let [u, v, w] = [f64::from(i) / 8.0, f64::from(j) / 8.0, f64::from(k) / 3.0];
+                    let (a, b) = ((u - 0.5) * 0.8, (v - 0.5) * 0.8);
+                    let radius = 3.0 + 0.02 * (9.0 * u).sin() * (7.0 * v).cos() + 0.6 * w;
+                    points.push(DVec3::new(a.sin() * b.cos(), b.sin(), a.cos() * b.cos()) * radius);
+                    values.push(DVec3::new(u, v, w));
+                }
+            }
+        }
+        for (lambda, expected) in
+            [(0.001, 2.6e-5), (0.01, 2.6e-4), (0.05, 1.2e-3), (0.1, 2.2e-3), (0.2, 3.9e-3), (0.5, 7.7e-3)]
+        {
+            let s = Interpolant::new(&points, &values, |_| lambda, Basis::Linear, 1.0).unwrap();
+            let squared: f64 = points.iter().zip(&values).map(|(p, v)| s.at(*p).distance_squared(*v)).sum();
+            let residual = (squared / (3 * points.len()) as f64).sqrt();
+            assert!((residual / expected - 1.0).abs() < 0.05, "{lambda}: {residual:e}");
+        }
+    }
+
+    #[test]
     fn lengths_do_not_matter_in_units() {
         let points = scattered(60);
         let values: Vec<DVec3> = points.iter().map(|p| DVec3::new(p.y, p.z, p.x) * p.x).collect();

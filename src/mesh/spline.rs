@@ -91,6 +91,29 @@ mod tests {
     }
 
     #[test]
+    fn frames_are_of_fourth_order() {
+        // A helix of radius 4 and slope 1.5: the reference's errors of the whole turn.
+        let (a, b) = (4.0f64, 1.5f64);
+        let speed = a.hypot(b);
+        let at =
+            |t: f64| (DVec3::new(a * t.cos(), a * t.sin(), b * t), DVec3::new(-a * t.sin(), a * t.cos(), b) / speed);
+        let normal = |t: f64| DVec3::new(-t.cos(), -t.sin(), 0.0);
+        for (samples, expected) in [(9, 1.3e-4), (17, 7.9e-6), (33, 4.9e-7), (65, 3.1e-8)] {
+            let (n, (_, tangent)) = (samples - 1, at(0.0));
+            let mut frame = DMat3::from_cols(normal(0.0), tangent.cross(normal(0.0)), tangent);
+            for k in 0..n {
+                let [p, q] = [k, k + 1].map(|k| std::f64::consts::TAU * f64::from(k) / f64::from(n));
+                frame = double_reflection(&frame, at(p), at(q));
+            }
+            let binormal = at(std::f64::consts::TAU).1.cross(normal(0.0));
+            let angle = frame.x_axis.dot(binormal).atan2(frame.x_axis.dot(normal(0.0)));
+            let turn = (angle + b / speed * std::f64::consts::TAU) / std::f64::consts::TAU;
+            let error = ((turn - turn.round()) * std::f64::consts::TAU).abs();
+            assert!((error / expected - 1.0).abs() < 0.05, "{samples}: {error:e}");
+        }
+    }
+
+    #[test]
     fn a_spline_runs_through_its_points_without_a_kink() {
         let points = [DVec3::ZERO, DVec3::new(3.0, 1.0, 0.0), DVec3::new(5.0, -1.0, 2.0), DVec3::new(5.5, 0.0, 7.0)];
         let spline = Spline::through(&points);

@@ -79,6 +79,8 @@ impl Cell {
 /// The cells of a volume, to be found by place.
 pub(super) struct Cells {
     cells: Vec<Cell>,
+    /// The sign of the map's determinant where it does not fold.
+    sign: f64,
     bin: f64,
     bins: FxHashMap<IVec3, SmallVec<[u32; 4]>>,
 }
@@ -125,7 +127,7 @@ impl Cells {
                 }
             }
         }
-        Self { cells, bin, bins }
+        Self { cells, sign: if volume.mirrors { -1.0 } else { 1.0 }, bin, bins }
     }
 
     /// Looks places up, one after the other.
@@ -206,14 +208,14 @@ impl Cells {
                 .map(|c| {
                     let t = DVec3::new((c >> 2) as f64, (c >> 1 & 1) as f64, (c & 1) as f64);
                     let (_, by_t) = cell.at(t);
-                    by_t.determinant() / (unit.x * unit.y * unit.z)
+                    self.sign * by_t.determinant() / (unit.x * unit.y * unit.z)
                 })
                 .fold(f64::INFINITY, f64::min);
             // Singular values of the base part, from the metric.
             let (e, f, g) = (j.x_axis.length_squared(), j.x_axis.dot(j.y_axis), j.y_axis.length_squared());
             let (mean, spread) = ((e + g) / 2.0, ((e - g) / 2.0).hypot(f));
             let (s1, s2) = ((mean + spread).sqrt(), (mean - spread).max(0.0).sqrt());
-            of_cells.push(CellDistortion { angle: s1 / s2, area: s1 * s2, volume: j.determinant(), least });
+            of_cells.push(CellDistortion { angle: s1 / s2, area: s1 * s2, volume: self.sign * j.determinant(), least });
         }
         Distortion { overlapping: self.overlaps(), ..Distortion::of(&of_cells) }
     }
@@ -336,7 +338,7 @@ mod tests {
             Net { counts: [nu, 4], points }
         };
         let levels = (0..layers).map(|k| k as f64 / (layers - 1) as f64).collect();
-        Volume { layers: (0..layers).map(net).collect(), levels }
+        Volume { layers: (0..layers).map(net).collect(), levels, mirrors: false }
     }
 
     #[test]

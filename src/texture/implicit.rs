@@ -11,9 +11,9 @@ use rustc_hash::FxHashMap;
 
 use super::OPERATION;
 use super::space::Patch;
-use super::wrap::{Made, Solid, block, catmull_rom, radius};
+use super::wrap::{Leaves, Made, Solid, block, catmull_rom, radius};
 use crate::error::{EditError, Result};
-use crate::grid::{LEAF_DIM, LeafMask, LeafValues, leaf_origin};
+use crate::grid::{LEAF_DIM, leaf_origin};
 use crate::rbf::{Basis, Interpolant};
 use crate::run::RunOptions;
 
@@ -60,11 +60,7 @@ impl<'a> Implicit<'a> {
         let (nu, nv, nw) = (count(lengths.x), count(lengths.y), count(lengths.z));
         // One layer behind the surface, as far as the space goes.
         let behind = (patch.depth / lengths.z).min(1.0);
-        let levels: Vec<f64> = match patch.raised {
-            true => std::iter::once(-behind).chain((0..=nw).map(|k| f64::from(k) / f64::from(nw))).collect(),
-            false => (0..=nw).map(|k| f64::from(k) / f64::from(nw)).chain([1.0 + behind]).collect(),
-        };
-        let on_surface = if patch.raised { 0.0 } else { 1.0 };
+        let levels: Vec<f64> = std::iter::once(-behind).chain((0..=nw).map(|k| f64::from(k) / f64::from(nw))).collect();
         let (mut places, mut values): (Vec<DVec3>, Vec<DVec3>) = (Vec::new(), Vec::new());
         for i in 0..=nu {
             for j in 0..=nv {
@@ -75,7 +71,7 @@ impl<'a> Implicit<'a> {
                 }
             }
         }
-        let lambda = |i: usize| rbf.lambda[usize::from(values[i].z != on_surface)];
+        let lambda = |i: usize| rbf.lambda[usize::from(values[i].z != 0.0)];
         let interpolant = Interpolant::new(&places, &values, lambda, rbf.basis, spacing).ok_or_else(|| {
             let accepted = "a patch and a height whose particles do not meet: a smaller height, the parameterization low-distortion, or the map inverse";
             EditError::parameter(OPERATION, "map", format!("implicit, {} particles", places.len()), accepted)
@@ -103,12 +99,7 @@ impl<'a> Implicit<'a> {
     }
 
     /// The leaves near the texture's surface, and how often a sum over all particles was taken.
-    pub fn leaves(
-        &self,
-        solid: &Solid,
-        leaves: Vec<IVec3>,
-        run: &RunOptions,
-    ) -> Result<(Vec<(IVec3, LeafValues, LeafMask)>, u64)> {
+    pub fn leaves(&self, solid: &Solid, leaves: Vec<IVec3>, run: &RunOptions) -> Result<(Leaves, u64)> {
         let mut sums = 0;
         let mut edge = LEAF_DIM;
         while edge > 2 && f64::from(edge) > NODES * self.spacing {

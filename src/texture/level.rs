@@ -78,7 +78,7 @@ impl Probe<'_> {
 
     /// The crossing of the level with an edge of the grid that is nearest to `x`, among those up to two voxels away along each axis.
     fn nearest_crossing(&mut self, x: DVec3) -> Option<DVec3> {
-        if !(x.abs().max_element() < f64::from(crate::grid::MAX_COORD - 4)) {
+        if !x.is_finite() || x.abs().max_element() > f64::from(crate::grid::MAX_COORD - 4) {
             return None;
         }
         let base = x.floor().as_ivec3();

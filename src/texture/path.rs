@@ -221,6 +221,18 @@ mod tests {
     }
 
     #[test]
+    fn refinement_finds_the_length_of_a_single_level() {
+        // The generic pair of the reference: 42.44 at first, 38.6586 at rest with 33 points.
+        let torus = torus(20.0, 8.0);
+        let mut probe = Level::new(&torus, 0.0).probe();
+        let a = probe.project(DVec3::X * 28.0).unwrap();
+        let b = probe.project(DVec3::new(12.0 * 1.8f64.cos(), 12.0 * 1.8f64.sin(), 5.0)).unwrap();
+        let path = geodesic(Level::new(&torus, 0.0), &[], a, b, 1.25).unwrap();
+        // Linear interpolation moves the surface by 0.02 voxel.
+        assert!((length(&path) - 38.6586).abs() < 0.05, "{} {}", length(&path), path.len());
+    }
+
+    #[test]
     fn resampling_keeps_ends_and_spacing() {
         let chain = [DVec3::ZERO, DVec3::X, DVec3::X * 4.0];
         let points = resampled(&chain, 4);

@@ -25,7 +25,7 @@ const LEAST_CORNER_REACH: f64 = 5.0;
 /// Largest patch and height, in voxels.
 const LARGEST: f64 = 4000.0;
 
-/// How far below the surface (or above it, if the texture goes down) the space goes on, in voxels beyond the half width of the band.
+/// How far below the surface (or above it, if the height goes down) the space goes on, in voxels beyond the half width of the band.
 const BEYOND: f64 = 2.0;
 
 /// How particles are distributed above a patch.
@@ -45,7 +45,7 @@ pub struct Patch {
     pub(super) cells: Cells,
     /// Lengths of the edges p1p2 and p1p4 and the height, in voxels.
     lengths: DVec3,
-    /// Whether w = 0 is on the surface; else w = 1 is.
+    /// Whether the space is outside of the surface.
     pub(super) raised: bool,
     /// How far the space goes on behind the surface, in voxels.
     pub(super) depth: f64,
@@ -69,7 +69,7 @@ impl Patch {
         let refuse = |accepted: String| EditError::parameter(OPERATION, "corners", &said, accepted);
         let corners = corners.map(|p| transform.world_to_index(p));
         let longest = (0..4).map(|k| corners[k].distance(corners[(k + 1) % 4])).fold(0.0, f64::max);
-        if !(longest <= LARGEST) {
+        if !longest.is_finite() || longest > LARGEST {
             let most = LARGEST * base.voxel_size();
             return Err(refuse(format!("corners at most {most} apart ({LARGEST} voxels)")));
         }
@@ -169,7 +169,8 @@ impl Space {
         let around = voxels.abs() + more + 8.0;
         let lo = points.iter().copied().fold(DVec3::INFINITY, DVec3::min) - around;
         let hi = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max) + around;
-        if !(lo.abs().max(hi.abs()).max_element() <= f64::from(MAX_COORD)) {
+        let farthest = lo.abs().max(hi.abs()).max_element();
+        if !farthest.is_finite() || farthest > f64::from(MAX_COORD) {
             let accepted = "a place within 2^30 voxels of the origin";
             return Err(EditError::parameter(OPERATION, "corners", format!("{lo} to {hi}, in voxels"), accepted));
         }

@@ -212,8 +212,10 @@ fn tiles_meet_without_gaps() {
         // Polygons that are moved meet face to face, with their rounded edges.
         let euler = if map == Map::SemiImplicit { measures.euler } else { 2 };
         assert_eq!((measures.components, measures.euler), (1, euler), "{map:?}");
-        // The outer edges are rounded by a part of a voxel.
-        assert!((measures.volume / (18.0 * 24.0 * 8.0) - 1.0).abs() < 0.05, "{map:?} {}", measures.volume);
+        // The outer edges are rounded by a part of a voxel; of moved polygons those of each tile.
+        let allowed = if map == Map::SemiImplicit { 0.08 } else { 0.05 };
+        let ratio = measures.volume / (18.0 * 24.0 * 8.0);
+        assert!((ratio - 1.0).abs() < allowed, "{map:?} {ratio}");
     }
 }
 
@@ -241,9 +243,9 @@ fn what_goes_down_is_carved() {
     let result = wrapped(&plane, &mut source(&texture), &patch, &LAYING, &run()).unwrap().level_set;
     let (lo, hi) = level_set_to_mesh(&result, 0.0, &run()).unwrap().bounding_box().unwrap();
     assert!((lo.z + 5.75).abs() < 0.05 && (hi.z - 0.25).abs() < 0.05, "{lo} {hi}");
-    // The peg of the texture still points up.
+    // As seen from outside the letter is not mirrored; its peg points down.
     let mut sampler = result.sampler();
-    assert!(
-        sampler.trilinear(DVec3::new(-6.0, 8.0, -0.5)) < 0.0 && sampler.trilinear(DVec3::new(6.0, -8.0, -0.5)) > 0.0
-    );
+    let mut inside = |x: f64, y: f64, z: f64| sampler.trilinear(DVec3::new(x, y, z)) < 0.0;
+    assert!(inside(6.0, -8.0, -1.0) && inside(-6.0, 8.0, -5.0) && !inside(6.0, 8.0, -1.0) && !inside(6.0, -8.0, -5.0));
+    assert_eq!(patch.distortion().folded, 0);
 }

@@ -33,6 +33,8 @@ const LEAST_SLOPE: f64 = 0.1;
 pub(super) struct Volume {
     pub layers: Vec<Net>,
     pub levels: Vec<f64>,
+    /// Whether w goes down, so that left and right are exchanged in space (and not as seen from outside).
+    pub mirrors: bool,
 }
 
 /// Where the layers of a volume lie, in voxels above the surface, and which of them hold the texture.
@@ -51,12 +53,12 @@ impl Heights {
         Self { below: vec![-depth], above: even(height, spacing), texture: [0.0, height] }
     }
 
-    /// The texture reaches `height` down from the surface; one layer `depth` above it takes what stands out.
+    /// The texture reaches `height` down from the surface, upside down; one layer `depth` above it takes what stands out.
     pub fn sunk(height: f64, depth: f64, spacing: f64) -> Self {
         Self {
             below: even(height, spacing).into_iter().map(|c| -c).collect(),
             above: vec![depth],
-            texture: [-height, 0.0],
+            texture: [0.0, -height],
         }
     }
 
@@ -65,7 +67,12 @@ impl Heights {
         let thinned = |levels: Vec<f64>| {
             let keep = levels.len().div_ceil(MOST_NETS).max(1);
             let last = levels.len();
-            levels.into_iter().enumerate().filter(|(i, _)| (last - 1 - i) % keep == 0).map(|(_, c)| c).collect()
+            levels
+                .into_iter()
+                .enumerate()
+                .filter(|(i, _)| (last - 1 - i).is_multiple_of(keep))
+                .map(|(_, c)| c)
+                .collect()
         };
         Self { below: thinned(self.below), above: thinned(self.above), texture: self.texture }
     }
@@ -74,10 +81,13 @@ impl Heights {
     fn volume(&self, below: Vec<Net>, base: Net, above: Vec<Net>) -> Volume {
         let [bottom, top] = self.texture;
         let heights = self.below.iter().rev().copied().chain([0.0]).chain(self.above.iter().copied());
-        Volume {
-            layers: below.into_iter().rev().chain([base]).chain(above).collect(),
-            levels: heights.map(|c| (c - bottom) / (top - bottom)).collect(),
+        let mut layers: Vec<Net> = below.into_iter().rev().chain([base]).chain(above).collect();
+        let mut levels: Vec<f64> = heights.map(|c| (c - bottom) / (top - bottom)).collect();
+        if top < bottom {
+            layers.reverse();
+            levels.reverse();
         }
+        Volume { layers, levels, mirrors: top < bottom }
     }
 }
 
@@ -242,7 +252,7 @@ fn climb(field: &LevelSet, from: DVec3, levels: &[f64], direction: Option<DVec3>
     let mut path = Vec::with_capacity(levels.len());
     let (mut x, mut c) = (from, 0.0);
     for &end in levels {
-        let steps = ((end - c) as f64).abs().div_euclid(STEP) as usize + 1;
+        let steps = (end - c).abs().div_euclid(STEP) as usize + 1;
         let step = (end - c) / steps as f64;
         for _ in 0..steps {
             c += step;

@@ -21,6 +21,9 @@ use crate::run::RunOptions;
 /// Half width of the band of a texture that is looked up, in its voxels: it tells blocks of voxels without its surface.
 const BAND: f32 = 12.0;
 
+/// That of the band which is made of its polygons first.
+const NARROW: f32 = 3.0;
+
 /// Which map takes places to the texture, or the texture to places.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Map {
@@ -98,7 +101,11 @@ impl Source {
         }
         let made = match key {
             i32::MIN => with_half_width(&self.given, BAND.max(self.given.half_width()), run)?,
-            _ => level_set_of_mesh(self.mesh.clone(), &Transform::uniform(power.exp2()), BAND, run)?,
+            _ => {
+                // The band widened from the coarser polygons, which are fewer.
+                let narrow = level_set_of_mesh(self.mesh.clone(), &Transform::uniform(power.exp2()), NARROW, run)?;
+                with_half_width(&narrow, BAND, run)?
+            }
         };
         self.lattices.insert(key, made.clone());
         Ok(made)
@@ -149,14 +156,13 @@ pub fn warped(
     let (lo, size) = (bounds.0, (bounds.1 - bounds.0).max(DVec3::splat(f64::MIN_POSITIVE)));
     let transform = base.transform();
     let push = laying.push / patch.lengths().z;
-    let push = if patch.raised { -push } else { push };
     let [nu, nv] = laying.tile.map(|n| n.max(1));
     let mut all = TriangleMesh::default();
     for tile in 0..nu * nv {
         let (i, j) = (f64::from(tile / nv), f64::from(tile % nv));
         let place = |p: &DVec3| {
             let t = (*p - lo) / size;
-            let uvw = DVec3::new((t.x + i) / f64::from(nu), (t.y + j) / f64::from(nv), t.z + push);
+            let uvw = DVec3::new((t.x + i) / f64::from(nu), (t.y + j) / f64::from(nv), t.z - push);
             transform.index_to_world(patch.place(uvw))
         };
         let first = all.positions.len() as u32;
@@ -239,23 +245,18 @@ impl<'a> Solid<'a> {
     /// ψ of a voxel whose (u, v, w) are known, in voxels of the base; at most the distance.
     pub fn distance(&self, probe: &mut Probe, ijk: DVec3, uvw: DVec3) -> f64 {
         let roots = self.push > 0.0;
-        // The faces on the surface go on into it, or out of it: what is just inside of them.
-        let w = match (roots, self.raised) {
-            (false, _) => uvw.z,
-            (true, true) => (uvw.z + self.push).max(self.rim.z),
-            (true, false) => (uvw.z - self.push).min(1.0 - self.rim.z),
-        };
-        let t = DVec3::new(self.repeated(uvw.x, 0), self.repeated(uvw.y, 1), w);
-        let at = self.texture.transform().world_to_index(self.lo + self.size * t);
-        let value = match self.sampling {
-            Sampling::Linear => f64::from(probe.0.trilinear(at)),
-            Sampling::Cubic => cubic(&mut probe.0, at),
-        };
+        // The faces on the surface go on behind it: what is just inside of them.
+        let w = if roots { (uvw.z + self.push).max(self.rim.z) } else { uvw.z };
+        let (u, v) = (self.repeated(uvw.x, 0), self.repeated(uvw.y, 1));
+        let [own, inner, face] = [0, 1, 2].map(|k| DVec3::new(u[k], v[k], w));
+        // By a face between tiles that the solid touches it goes on into the next tile: faces that meet are no gap. What ends before the face is one.
+        let touches = own != inner && self.value(probe, face) < ROUNDED * self.texture.voxel_size();
+        let value = self.value(probe, if touches { inner } else { own });
         let phi = value / self.stretch;
         if !roots || phi >= 0.0 {
             return phi;
         }
-        let behind = if self.raised { -uvw.z * self.height } else { (uvw.z - 1.0) * self.height };
+        let behind = -uvw.z * self.height;
         let phi = phi.max(behind - self.depth);
         if self.raised && behind > SKIN {
             // Not out of the other side of a thin wall.
@@ -264,14 +265,28 @@ impl<'a> Solid<'a> {
         phi
     }
 
-    /// The place in the texture of u or v: between two tiles, what is just inside of their faces, so that faces that meet are no gap.
-    fn repeated(&self, t: f64, axis: usize) -> f64 {
+    /// φ at a place of the texture's box, 0..1³.
+    fn value(&self, probe: &mut Probe, t: DVec3) -> f64 {
+        let at = self.texture.transform().world_to_index(self.lo + self.size * t);
+        match self.sampling {
+            Sampling::Linear => f64::from(probe.0.trilinear(at)),
+            Sampling::Cubic => cubic(&mut probe.0, at),
+        }
+    }
+
+    /// The place in the texture of u or v, that place kept away from the faces between tiles, and the one just inside of such a face if it is by one.
+    fn repeated(&self, t: f64, axis: usize) -> [f64; 3] {
         let n = self.tile[axis];
         let cell = (t * n).floor().clamp(0.0, n - 1.0);
-        let within = t * n - cell;
-        let low = if cell > 0.0 { self.rim[axis] } else { f64::NEG_INFINITY };
-        let high = if cell < n - 1.0 { 1.0 - self.rim[axis] } else { f64::INFINITY };
-        within.clamp(low, high)
+        let (own, rim) = (t * n - cell, self.rim[axis]);
+        let skin = (0.5 * self.texture.voxel_size() / self.size[axis]).min(rim);
+        if cell > 0.0 && own < rim {
+            [own, rim, skin]
+        } else if cell < n - 1.0 && own > 1.0 - rim {
+            [own, 1.0 - rim, 1.0 - skin]
+        } else {
+            [own; 3]
+        }
     }
 }
 
@@ -290,12 +305,16 @@ pub(super) fn catmull_rom(t: f64) -> [f64; 4] {
 /// How far the surface may lie below the particles' net, in voxels: as far a texture goes on behind it in any case.
 const SKIN: f64 = 1.5;
 
+/// What voxels round off the edges of a solid by, in those voxels.
+const ROUNDED: f64 = 0.3;
+
 /// How far inside of a face that goes on the texture is looked up, in voxels of the base: nearer, its distance would be lost between them.
 const RIM: f64 = 1.5;
 
 /// φ between voxels by Catmull and Rom's splines along each axis.
 fn cubic(sampler: &mut Sampler, ijk: DVec3) -> f64 {
-    if !(ijk.abs().max_element() < f64::from(MAX_COORD - 4)) {
+    let is_far = !ijk.is_finite() || ijk.abs().max_element() > f64::from(MAX_COORD - 4);
+    if is_far {
         return f64::from(sampler.trilinear(ijk));
     }
     let base = ijk.floor();
@@ -358,7 +377,8 @@ pub(super) fn block(edge: i32) -> impl Iterator<Item = IVec3> {
     (0..edge.pow(3)).map(move |i| IVec3::new(i / (edge * edge), i / edge % edge, i % edge))
 }
 
-type Leaves = Vec<(IVec3, LeafValues, LeafMask)>;
+/// Leaves of a grid: origin, values, which are active.
+pub(super) type Leaves = Vec<(IVec3, LeafValues, LeafMask)>;
 
 /// Blocks in which a leaf is looked at first.
 const BLOCK: i32 = 4;

@@ -25,6 +25,9 @@ use crate::run::RunOptions;
 /// How much longer paths along edges are than the coordinates that they lead to, at most.
 const DETOUR: f64 = 1.5;
 
+/// Voxels around that: the triangles at the rim of a small patch are whole, whichever way their diagonals run.
+const RIM: f64 = 4.0;
+
 /// Below this sum of weights nothing leads to a vertex from the seed's side.
 const LEAST_AHEAD: f64 = 1e-6;
 
@@ -94,7 +97,7 @@ impl Patch {
             return Err(far(Some(squared.sqrt())));
         }
         // The part that can be reached, with vertices numbered anew.
-        let limit = (radius * 1.2 + 4.0).powi(2);
+        let limit = (radius * 1.2 + RIM).powi(2);
         let mut numbers = vec![u32::MAX; positions.len()];
         let (mut local, mut triangles, mut seed_triangle) = (Vec::new(), Vec::new(), 0);
         for (i, triangle) in mesh.triangles.iter().enumerate() {
@@ -274,7 +277,7 @@ fn flattened(
     seed: &Seed,
     radius: f64,
 ) -> Vec<Option<DVec2>> {
-    let farthest = radius * DETOUR;
+    let farthest = radius * DETOUR + RIM;
     let around = neighbours(positions.len(), triangles);
     let rounds = (radius * AVERAGED).powi(2).min(MOST_ROUNDS) as usize;
     let normals = averaged(normals.to_vec(), &around, rounds);

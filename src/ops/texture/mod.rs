@@ -131,7 +131,7 @@ pub struct Texture {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("x-kind" = "'spacing=… radius=… seed=…'"))]
     pub scatter: Option<String>,
-    /// How high the texture stands on the surface, or how deep it goes if negative; as the width of the patch and the shape of the texture make it if not given.
+    /// How high the texture stands on the surface, or how deep it goes, upside down, if negative; as the width of the patch and the shape of the texture make it if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height: Option<WorldLength>,
     /// How often the texture is repeated along u and v.

@@ -142,7 +142,7 @@ impl Place {
                 let hi = corners.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
                 (lo, hi, lo.distance(hi))
             }
-            Self::Around { center, radius, .. } => (*center, *center, radius * 3.0),
+            Self::Around { center, radius, .. } => (*center, *center, radius * 2.0),
         };
         let transform = base.transform();
         let corners = (0..8).map(|c| {
@@ -150,7 +150,7 @@ impl Place {
             transform.world_to_index(DVec3::new(pick(0), pick(1), pick(2)))
         });
         let (lo, hi) = corners.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(a, b), p| (a.min(p), b.max(p)));
-        let margin = (around + 2.0 * height) / base.voxel_size() + 4.0 * f64::from(base.half_width()) + 16.0;
+        let margin = (around + height) / base.voxel_size() + 4.0 * f64::from(base.half_width()) + 16.0;
         cut_out(base, (lo, hi), margin, run)
     }
 }
