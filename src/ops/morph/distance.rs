@@ -13,7 +13,7 @@ use crate::mesh::{Bvh, level_set_to_mesh};
 use crate::run::RunOptions;
 
 /// Most nodes of the lattice.
-const MOST_NODES: f64 = 524_288.0;
+const MOST_NODES: f64 = 150_000.0;
 
 /// Voxels around the shapes that it covers.
 const MARGIN: i32 = 4;
