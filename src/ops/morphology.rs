@@ -25,6 +25,12 @@ use crate::run::RunOptions;
 
 /// Moves the surface by `distance` (world units, positive outwards); the band keeps its half width.
 pub fn offset(level_set: &LevelSet, distance: f64, run: &RunOptions) -> Result<LevelSet> {
+    rebuild(level_set, &Rebuild { offset: distance, ..Rebuild::band(level_set.half_width()) }, run)
+}
+
+/// The way back of an opening or closing. Exact offsets have truly sharp edges, where the surface was thinner or bent more than the distance: these are kept,
+/// not cut off by polygons. Elsewhere, fields hold noise that looks like edges, and offsets are those of the polygons.
+pub(super) fn offset_back(level_set: &LevelSet, distance: f64, run: &RunOptions) -> Result<LevelSet> {
     rebuild(level_set, &Rebuild { offset: distance, sharp: true, ..Rebuild::band(level_set.half_width()) }, run)
 }
 
@@ -52,9 +58,9 @@ fn moved(
     let was_empty = input.is_empty();
     let length = distance.world(input.voxel_size());
     let all = |level_set: LevelSet| {
-        signs.iter().try_fold(level_set, |level_set, sign| {
+        signs.iter().enumerate().try_fold(level_set, |level_set, (step, sign)| {
             run.check(operation)?;
-            offset(&level_set, sign * length, run)
+            if step == 0 { offset(&level_set, sign * length, run) } else { offset_back(&level_set, sign * length, run) }
         })
     };
     let result = match region.on(&input, run)? {
