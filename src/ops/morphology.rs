@@ -28,9 +28,9 @@ pub fn offset(level_set: &LevelSet, distance: f64, run: &RunOptions) -> Result<L
     rebuild(level_set, &Rebuild { offset: distance, ..Rebuild::band(level_set.half_width()) }, run)
 }
 
-/// The way back of an opening or closing. Exact offsets have truly sharp edges, where the surface was thinner or bent more than the distance: these are kept,
-/// not cut off by polygons. Elsewhere, fields hold noise that looks like edges, and offsets are those of the polygons.
-pub(super) fn offset_back(level_set: &LevelSet, distance: f64, run: &RunOptions) -> Result<LevelSet> {
+/// A step of an opening or closing: the same, but the field's sharp edges on the side that the surface moves to are kept, which polygons cut off. The
+/// way back would carry the error of a cut edge over the whole rounding that it leaves.
+pub(super) fn offset_sharp(level_set: &LevelSet, distance: f64, run: &RunOptions) -> Result<LevelSet> {
     rebuild(level_set, &Rebuild { offset: distance, sharp: true, ..Rebuild::band(level_set.half_width()) }, run)
 }
 
@@ -58,9 +58,10 @@ fn moved(
     let was_empty = input.is_empty();
     let length = distance.world(input.voxel_size());
     let all = |level_set: LevelSet| {
-        signs.iter().enumerate().try_fold(level_set, |level_set, (step, sign)| {
+        let step = if signs.len() == 1 { offset } else { offset_sharp };
+        signs.iter().try_fold(level_set, |level_set, sign| {
             run.check(operation)?;
-            if step == 0 { offset(&level_set, sign * length, run) } else { offset_back(&level_set, sign * length, run) }
+            step(&level_set, sign * length, run)
         })
     };
     let result = match region.on(&input, run)? {

@@ -16,7 +16,7 @@
 use glam::IVec3;
 
 use super::csg::{CsgOperation, csg};
-use super::morphology::{offset, offset_back};
+use super::morphology::offset_sharp;
 use crate::error::Result;
 use crate::grid::{LEAF_VOXELS, offset_to_local};
 use crate::levelset::{Components, CurvatureKind, LevelSet, curvature};
@@ -39,7 +39,7 @@ pub(super) fn rolled(level_set: &LevelSet, radius: f64, rounds: bool, run: &RunO
         false => (CsgOperation::Union, CsgOperation::Difference),
         true => (CsgOperation::Intersection, CsgOperation::Union),
     };
-    let mut rolled = offset_back(&offset(level_set, outwards * radius, run)?, -outwards * radius, run)?;
+    let mut rolled = offset_sharp(&offset_sharp(level_set, outwards * radius, run)?, -outwards * radius, run)?;
     // What was added or removed, where it is thicker than that.
     let changed = match rounds {
         false => csg(&rolled, &[&grown(level_set, least)], CsgOperation::Difference, run)?,

@@ -167,7 +167,7 @@ mod tests {
             "maximum" => value.as_f64().is_none_or(|v| v <= rule.as_f64().unwrap()),
             "pattern" if rule == "\\$" => value.as_str().is_none_or(|text| text.contains('$')),
             "pattern" | "propertyNames" | "format" | "default" | "description" | "title" | "$schema" | "$defs" => true,
-            "x-kind" | "x-list" => true,
+            "x-kind" | "x-list" | "x-count" => true,
             other => panic!("the test does not know `{other}`"),
         })
     }
