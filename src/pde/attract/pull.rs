@@ -1,0 +1,216 @@
+//! The force on a surface: what a voxel feels of the target.
+
+use glam::{DVec3, IVec3};
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+
+use super::{Attraction, Attractor, IndexBounds, OPERATION, REACHED};
+use crate::error::{EditError, Result};
+use crate::grid::{LEAF_DIM, offset_to_local};
+use crate::levelset::{LevelSet, Sampler};
+use crate::region::{Region, ramp_between};
+use crate::run::RunOptions;
+
+/// Half the width, as a cosine, of the window over which C's slope is taken: as much as neighbouring normals differ.
+const WINDOW: f64 = 0.05;
+
+/// How far upwind normals are read, in voxels, and the sine of the angle between n and u from which on: towards the target there is no upwind.
+const UPWIND: f64 = 0.25;
+const ASKEW: f64 = 0.1;
+
+/// The cosine from which on a surface within the tip is drawn fully.
+const SIDEWAYS: f64 = 0.5;
+
+/// The closest surface point of a target is told by the foot points of voxels, which are no farther from it than this, in voxels.
+const FOOTING: f64 = 0.5;
+
+/// Voxels around what is drawn and what draws it that may change as well.
+const MARGIN: f64 = 6.0;
+
+/// What a voxel feels.
+pub(super) struct Felt {
+    /// F, world units a unit of time.
+    pub speed: f64,
+    /// C.
+    pub share: f64,
+    /// Speed, in voxels a unit of time, at which changes of the normal travel along the surface.
+    pub travel: f64,
+    /// |φ(p)| in voxels, or how far a pushed surface still goes.
+    pub gap: f64,
+    /// From the surface to the target, in voxels.
+    pub distance: f64,
+    /// The target.
+    pub point: DVec3,
+}
+
+/// The force on a surface.
+pub struct Pull<'a> {
+    target: &'a dyn Attractor,
+    pub(super) how: &'a Attraction,
+    pub(super) region: Option<&'a dyn Region>,
+    /// Points of the surface as it was, where the region lets it move.
+    before: ImmutableKdTree<f64, 3>,
+}
+
+impl<'a> Pull<'a> {
+    /// The force on a level set, where `region` lets it move; `None` if that is nowhere.
+    pub fn new(
+        level_set: &LevelSet,
+        target: &'a dyn Attractor,
+        how: &'a Attraction,
+        region: Option<&'a dyn Region>,
+        run: &RunOptions,
+    ) -> Result<Option<Self>> {
+        let feet = beside_surface(level_set, region, run, |feet: &mut Vec<[f64; 3]>, sampler, ijk| {
+            feet.extend(foot(sampler, level_set.voxel_size(), ijk).map(|(foot, _)| foot.to_array()));
+        })?;
+        let feet: Vec<[f64; 3]> = feet.concat();
+        if feet.is_empty() {
+            return Ok(None);
+        }
+        let before = ImmutableKdTree::new_from_slice(&feet).map_err(|e| {
+            EditError::parameter(
+                OPERATION,
+                "region",
+                format!("{} voxels", feet.len()),
+                format!("a smaller part of the surface: {e}"),
+            )
+        })?;
+        Ok(Some(Self { target, how, region, before }))
+    }
+
+    /// A box around what is drawn and what draws it, with a margin; `None` if nothing is drawn.
+    pub fn drawn_within(&self, level_set: &LevelSet, run: &RunOptions) -> Result<Option<IndexBounds>> {
+        let voxel_size = level_set.voxel_size();
+        let boxes = beside_surface(level_set, self.region, run, |drawn: &mut Drawn, sampler, ijk| {
+            // At the start nothing has been pushed: no depth counts yet.
+            let Some(felt) = self.at(sampler, None, voxel_size, ijk, drawn.near) else { return };
+            drawn.near = Some(felt.point);
+            if felt.share > 0.0 && (self.how.repel || felt.gap >= REACHED) {
+                let (a, b) = (ijk.as_dvec3().min(felt.point), ijk.as_dvec3().max(felt.point));
+                drawn.bounds = Some(drawn.bounds.map_or((a, b), |(lo, hi)| (lo.min(a), hi.max(b))));
+            }
+        })?;
+        let bounds = boxes.into_iter().filter_map(|drawn| drawn.bounds).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
+        Ok(bounds.map(|(lo, hi)| (lo - MARGIN, hi + MARGIN)))
+    }
+
+    /// Part of what faces a target at `distance` that is near enough to it, if the surface is now `gap` away from it.
+    fn reach(&self, point: DVec3, distance: f64, gap: f64) -> f64 {
+        // Feet of voxels stand for the surface between them.
+        let weight = |nearest: f64| self.how.cut_off.weight((nearest + FOOTING) / distance.max(FOOTING));
+        // What is drawn has come nearer since the start. What is pushed goes away: its distance says nothing.
+        if self.how.repel || weight(gap) >= 1.0 {
+            return 1.0;
+        }
+        let nearest =
+            self.before.query(&point.to_array()).nearest_one::<SquaredEuclidean<f64>>().execute().distance.sqrt();
+        weight(nearest)
+    }
+
+    /// What the voxel at `ijk` feels; `None` where the field has no normal, or without a target. `near` is a point of the target, the nearer the
+    /// better: it bounds the search. Depths are measured in the field `original`.
+    pub(super) fn at(
+        &self,
+        sampler: &mut Sampler,
+        original: Option<&LevelSet>,
+        voxel_size: f64,
+        ijk: IVec3,
+        near: Option<DVec3>,
+    ) -> Option<Felt> {
+        let (foot, normal) = foot(sampler, voxel_size, ijk)?;
+        // Wide enough for the rounding of a point that is found again.
+        let within = near.map_or(f64::INFINITY, |near| near.distance(foot) * (1.0 + 1e-9) + 1e-9);
+        let point = self.target.closest(foot, within)?;
+        let (to, phi) = (point - foot, f64::from(sampler.trilinear(point)));
+        let distance = to.length();
+        let towards = if distance > 1e-6 { to / distance * phi.signum() } else { normal };
+        let tip = self.how.tip;
+        let close = if tip > 0.0 { 1.0 - ramp_between(distance, tip / 2.0, tip) } else { 0.0 };
+        let mut cosine = normal.dot(towards);
+        let mut gap = phi.abs() / voxel_size;
+        let faces = self.how.cut_off.weight(cosine + WINDOW) > 0.0;
+        let reach = if faces && close < 1.0 { self.reach(point, distance, gap) } else { 1.0 };
+        let share =
+            |cosine: f64| (reach * self.how.cut_off.weight(cosine)).max(close * ramp_between(cosine, 0.0, SIDEWAYS));
+        let slope = (share(cosine + WINDOW) - share(cosine - WINDOW)) / (2.0 * WINDOW);
+        let aside = towards - normal * cosine;
+        let travel = slope * gap * aside.length();
+        if travel > 0.0 {
+            // What draws has its upwind away from the target, what pushes towards it.
+            let upwind = if self.how.repel { UPWIND } else { -UPWIND };
+            let there = foot + aside * (phi.signum() * upwind / aside.length().max(ASKEW));
+            cosine = sampler.smooth_gradient(there).try_normalize()?.dot(towards);
+        }
+        let mut share = share(cosine);
+        let mut speed = phi;
+        if self.how.repel {
+            speed = -phi;
+            if let (Some(depth), Some(original)) = (self.how.max_depth, original) {
+                let gone = f64::from(original.sampler().trilinear(foot)).abs() / voxel_size;
+                gap = (depth - gone).max(0.0);
+                // In the last voxel the rest of the way closes like a gap, and no faster than the step allows.
+                let rest = gap * voxel_size;
+                speed = speed.signum() * speed.abs().max(voxel_size).min(rest);
+            }
+            // The target that is touched pushes nowhere.
+            if phi == 0.0 {
+                share = 0.0;
+            }
+        }
+        Some(Felt { speed: share * speed, share, travel, gap, distance, point })
+    }
+}
+
+/// The surface point closest to a voxel, and the outward normal there.
+fn foot(sampler: &mut Sampler, voxel_size: f64, ijk: IVec3) -> Option<(DVec3, DVec3)> {
+    let phi = f64::from(sampler.voxel(ijk)) / voxel_size;
+    let mut foot = ijk.as_dvec3() - sampler.voxel_gradient(ijk).try_normalize()? * phi;
+    // There the stencil lies within the band: once more for what the first step missed.
+    let gradient = sampler.smooth_gradient(foot);
+    let squared = gradient.length_squared();
+    if squared < 1e-2 {
+        return None;
+    }
+    let rest = f64::from(sampler.trilinear(foot)) / voxel_size;
+    foot -= gradient * (rest / squared).clamp(-1.0, 1.0);
+    Some((foot, gradient / squared.sqrt()))
+}
+
+/// The part of a leaf that is drawn.
+#[derive(Default)]
+struct Drawn {
+    bounds: Option<IndexBounds>,
+    /// The target of the voxel before.
+    near: Option<DVec3>,
+}
+
+/// What `f` gathers, leaf by leaf, of the voxels beside the surface that `region` lets move; these stand for the others on their normals.
+fn beside_surface<T: Default + Send>(
+    level_set: &LevelSet,
+    region: Option<&dyn Region>,
+    run: &RunOptions,
+    f: impl Fn(&mut T, &mut Sampler, IVec3) + Sync,
+) -> Result<Vec<T>> {
+    let (grid, transform, voxel_size) = (level_set.grid(), level_set.transform(), level_set.voxel_size());
+    let half = (f64::from(LEAF_DIM) - 1.0) / 2.0;
+    let found = grid.map_leaves(|id| {
+        let (origin, values, mut found) = (grid.origin(id), grid.values(id), T::default());
+        let centre = transform.index_to_world(origin.as_dvec3() + half);
+        let reached = region.is_none_or(|r| r.weights_within(centre, half * 3f64.sqrt() * voxel_size)[1] > 0.0);
+        if !reached || run.is_cancelled() {
+            return found;
+        }
+        let mut sampler = level_set.sampler();
+        for offset in grid.mask(id).iter() {
+            let ijk = origin + offset_to_local(offset);
+            if f64::from(values.0[offset].abs()) <= voxel_size
+                && region.is_none_or(|r| r.weight(transform.voxel_to_world(ijk)) > 0.0)
+            {
+                f(&mut found, &mut sampler, ijk);
+            }
+        }
+        found
+    });
+    run.check(OPERATION)?;
+    Ok(found)
+}
