@@ -186,7 +186,7 @@ impl Motion for Moving<'_> {
         match self.bending {
             0.0 => tracker.integrate(&FirstOrder(step), TimeIntegrator::TvdRk1, Target::Moving),
             bending => tracker.integrate(
-                &Bending { speed: &self.speed, twice: 2.0 * bending as f32, dt: dt as f32, voxel_size },
+                &SmoothedStep { speed: &self.speed, twice: 2.0 * bending as f32, dt: dt as f32, voxel_size },
                 TimeIntegrator::TvdRk1,
                 Target::Moving,
             ),
@@ -243,16 +243,17 @@ impl Work for Feet<'_> {
     }
 }
 
-/// φ − dt(F − 2βH)|∇φ|.
-struct Bending<'a> {
-    speed: &'a Paged<LeafValues>,
+/// One Euler step φ − dt(F − 2βH)|∇φ| with F a field, world units a unit of time, and β in world².
+pub(super) struct SmoothedStep<'a> {
+    /// F.
+    pub speed: &'a Paged<LeafValues>,
     /// 2β.
-    twice: f32,
-    dt: f32,
-    voxel_size: f32,
+    pub twice: f32,
+    pub dt: f32,
+    pub voxel_size: f32,
 }
 
-impl LeafKernel for Bending<'_> {
+impl LeafKernel for SmoothedStep<'_> {
     const REACH: usize = <Halo as LeafHalo>::REACH;
 
     type Scratch = Halo;

@@ -12,11 +12,11 @@
 //!
 //! Godunov's |∇φ| for D, central differences for the curvature; 1/dt = 1/dt_D + 1/dt_κ with dt_D = ½/(1 − β), dt_κ = 0.9/(6β).
 
-use fearless_simd::{Simd, SimdBase, SimdFloat};
 use glam::IVec3;
 
 use super::evolve::{Motion, Report, Until, drive};
-use super::step::{LeafKernel, Rows, Target};
+use super::step::Target;
+use super::surface_speed::SmoothedStep;
 use super::tracker::Tracker;
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::{EditError, Result};
@@ -24,10 +24,6 @@ use crate::grid::{Grid, LeafId, LeafValues, PageLeaves, Paged, offset_to_local};
 use crate::levelset::LevelSet;
 use crate::region::Region;
 use crate::run::RunOptions;
-use crate::stencil::curvature::mean_curvature;
-use crate::stencil::simd::Lanes;
-use crate::stencil::upwind::godunov_first;
-use crate::stencil::{Halo, LeafHalo};
 
 /// Steps between two looks at whether the surface still moves, and the mean motion in voxels a look below which it rests.
 const LOOK_EVERY: u32 = 10;
@@ -90,7 +86,7 @@ impl Motion for Growth<'_> {
         self.speed.truncate(pages);
         // Voxels are written before they are read.
         self.speed.grow_unwritten(pages);
-        let (membership, weight) = (self.membership, 1.0 - self.smoothness as f32);
+        let (membership, weight) = (self.membership, (1.0 - self.smoothness as f32) * tracker.voxel_size());
         self.speed.par_update_pages(tracker.domain.leaves(), |leaves, speed| {
             leaves.for_each(|id| {
                 let (speed, origin) = (&mut speed[PageLeaves::slot(id)].0, grid.origin(id));
@@ -104,49 +100,10 @@ impl Motion for Growth<'_> {
     }
 
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
-        let step = GrowthStep {
-            speed: &self.speed,
-            smoothness: self.smoothness as f32,
-            dt: dt as f32,
-            voxel_size: tracker.voxel_size(),
-        };
+        let voxel_size = tracker.voxel_size();
+        let twice = 2.0 * self.smoothness as f32 * voxel_size * voxel_size;
+        let step = SmoothedStep { speed: &self.speed, twice, dt: dt as f32, voxel_size };
         tracker.integrate(&step, TimeIntegrator::TvdRk1, Target::Moving)
-    }
-}
-
-struct GrowthStep<'a> {
-    speed: &'a Paged<LeafValues>,
-    smoothness: f32,
-    dt: f32,
-    voxel_size: f32,
-}
-
-impl LeafKernel for GrowthStep<'_> {
-    const REACH: usize = <Halo as LeafHalo>::REACH;
-
-    type Scratch = Halo;
-
-    fn scratch(&self) -> Halo {
-        Halo::new()
-    }
-
-    #[inline(always)]
-    fn euler<S: Simd>(&self, simd: S, grid: &Grid, id: LeafId, rows: Rows, halo: &mut Halo, out: &mut LeafValues) {
-        halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
-        let (h, dt) = (self.voxel_size, self.dt);
-        let bending = 2.0 * self.smoothness * h * h;
-        let speed = &self.speed.get(id).0;
-        rows.for_each_pair(
-            #[inline(always)]
-            |x, y, _| {
-                let at = x * 64 + y * 8;
-                let grows = Lanes::from_slice(simd, &speed[at..at + 16]);
-                // Unscaled differences: h|∇φ|.
-                let steepness = godunov_first(simd, halo, x, y, grows).sqrt();
-                let rate = grows * steepness - mean_curvature(simd, halo, x, y, h).motion * bending;
-                (halo.centre(simd, x, y) - rate * dt).store_slice(&mut out.0[at..at + 16]);
-            },
-        );
     }
 }
 

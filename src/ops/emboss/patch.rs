@@ -9,7 +9,7 @@
 //! The normals are averaged over a part of the patch first: so it is the surface without its relief that is laid flat, and a stamp
 //! crosses a fold or a ribbon as if it was projected on it. The paper keeps the length of each edge instead, which follows every wrinkle.
 //!
-//! Exact on planes and, up to the polygons, on developable surfaces; on a sphere within a fifth of a percent of the radius (rms), up to one radius from the seed. Beyond the radius π/√max K it folds: [`Patch::folded`] counts.
+//! Exact on planes and, up to the polygons, on developable surfaces; on a sphere within 0.4 % of the radius (rms), up to one radius from the seed. Beyond the radius π/√max K it folds: [`Patch::folded`] counts.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;

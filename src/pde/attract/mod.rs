@@ -22,6 +22,8 @@
 //! Whatever faces a target would be drawn, at any distance, the other side of a solid among it. So γ is also bounded by what it would be if the
 //! surface closest to p were a plane, d(p)/|p − y| with d the distance of p from the surface at the start.
 //!
+//! A curve or point many voxels away draws a fin or a spine that ends thinner than a voxel: its rim is ragged, and specks may break off.
+//!
 //! Pushed surfaces move by −F, faster and faster: a largest depth, measured from where the surface was, or a time ends it. All that faces the target is
 //! pushed, at any distance: a region holds what is to stay.
 

@@ -26,9 +26,6 @@ const COURANT: f64 = 0.5;
 /// Travel of what changes the normal in a step, in voxels.
 const TRAVEL: f64 = 0.4;
 
-/// Most parts of a step.
-const MOST_PARTS: f64 = 16.0;
-
 /// Longest step where a time was asked for: a step closes its part of the gap, and a twentieth keeps that within 3 % of e^(−t).
 const LONGEST_TIMED: f64 = 0.05;
 
@@ -280,7 +277,7 @@ impl Motion for Drawing<'_> {
         self.anchor(tracker);
         let mut left = dt;
         loop {
-            let part = if self.substep < left { left / (left / self.substep).ceil().min(MOST_PARTS) } else { left };
+            let part = left / (left / self.substep).ceil().max(1.0);
             let rates = &self.rates;
             let leaves = tracker.grid.leaves().iter().copied().filter(|id| rates.contains_key(&id.index())).collect();
             tracker.grid.update(&leaves, |id, values, mask| {
