@@ -137,7 +137,9 @@ impl Primitive {
 
     #[inline(always)]
     fn weigh_in(&self, shape: &Shape, xyz: &[DVec3], alpha: &mut [f32]) {
-        alpha.iter_mut().zip(xyz).for_each(|(alpha, xyz)| *alpha = self.weight_in(shape, *xyz));
+        for (alpha, xyz) in alpha.iter_mut().zip(xyz) {
+            *alpha = self.weight_in(shape, *xyz);
+        }
     }
 }
 

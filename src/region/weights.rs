@@ -1,5 +1,7 @@
 //! A region evaluated on a grid: α at the active voxels of the leaves that it touches.
 
+use fearless_simd::Simd;
+use glam::DVec3;
 use rayon::prelude::*;
 
 use super::Region;
@@ -7,6 +9,7 @@ use crate::grid::{
     Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafSet, LeafValues, PAGE_LEAVES, PageLeaves, Paged, Transform,
     offset_to_local,
 };
+use crate::stencil::simd::{Work, dispatch};
 
 /// α at the active voxels of a grid, by leaf slot. Voxels are looked at when they become active. Only leaves at the region's rim have
 /// values of their own.
@@ -52,7 +55,13 @@ impl RegionWeights {
             known: Paged::default(),
             leaves: LeafSet::default(),
         };
-        let touched = |id: &LeafId| range(grid, transform, region, *id)[1] > 0.0;
+        // In index space a leaf is beside a box at a glance.
+        let bounds = region.bounds().map(|bounds| transform.box_to_index(bounds));
+        let near = |id| {
+            let origin = grid.origin(id).as_dvec3();
+            bounds.is_none_or(|(lo, hi)| (origin + f64::from(LEAF_DIM)).cmpge(lo).all() && origin.cmple(hi).all())
+        };
+        let touched = |id: &LeafId| near(*id) && range(grid, transform, region, *id)[1] > 0.0;
         let touched: Vec<_> = grid.leaves().par_iter().copied().filter(touched).collect();
         weights.evaluate(grid, transform, region, &touched.into_iter().collect());
         weights
@@ -91,24 +100,21 @@ impl RegionWeights {
         self.rim.grow_unwritten(self.rim_leaves.len().div_ceil(PAGE_LEAVES));
         let rim_leaves = &self.rim_leaves;
         let found = self.rim.par_update_pages(&touched, |slots, alpha| {
-            let (mut xyz, mut found) = (Vec::with_capacity(LEAF_VOXELS), [0.0; LEAF_VOXELS]);
-            let weigh = |slot: LeafId| {
+            let mut places = [DVec3::ZERO; LEAF_VOXELS];
+            let mut found = Vec::with_capacity(slots.iter().count());
+            for slot in slots.iter() {
                 let id = rim_leaves[slot.index()];
-                let (origin, new, alpha) = (grid.origin(id), unknown(id), &mut alpha[PageLeaves::slot(slot)]);
+                let alpha = &mut alpha[PageLeaves::slot(slot)];
                 if known.get(id).is_empty() {
                     alpha.0.fill(0.0);
                 }
-                xyz.clear();
-                xyz.extend(new.iter().map(|offset| transform.voxel_to_world(origin + offset_to_local(offset))));
-                region.weights(&xyz, &mut found);
                 let mut positive = LeafMask::EMPTY;
-                for (offset, found) in new.iter().zip(found) {
-                    alpha.0[offset] = found.clamp(0.0, 1.0);
-                    positive.set(offset, found > 0.0);
-                }
-                (id, positive)
-            };
-            slots.iter().map(weigh).collect::<Vec<_>>()
+                let (new, origin) = (unknown(id), grid.origin(id).as_dvec3());
+                let positive_here = &mut positive;
+                dispatch(RimLeaf { region, transform, origin, new, alpha, positive: positive_here, places: &mut places });
+                found.push((id, positive));
+            }
+            found
         });
         for (id, new) in found.into_iter().flatten() {
             let positive = self.positive.get_mut(id);
@@ -164,6 +170,45 @@ impl RegionWeights {
     #[inline(always)]
     pub fn positive(&self, id: LeafId) -> LeafMask {
         *self.positive.get(id)
+    }
+}
+
+/// α at the voxels `new` of a leaf. As vector work because bits are found one by one otherwise.
+struct RimLeaf<'a> {
+    region: &'a dyn Region,
+    transform: &'a Transform,
+    origin: DVec3,
+    new: LeafMask,
+    alpha: &'a mut LeafValues,
+    positive: &'a mut LeafMask,
+    places: &'a mut [DVec3; LEAF_VOXELS],
+}
+
+impl Work for RimLeaf<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let to_world = self.transform.to_world();
+        let mut count = 0;
+        self.new.for_each(
+            #[inline(always)]
+            |offset| {
+                let ijk = self.origin + offset_to_local(offset).as_dvec3();
+                self.places[count] = to_world.transform_point3(ijk);
+                count += 1;
+            },
+        );
+        let mut found = [0.0; LEAF_VOXELS];
+        self.region.weights(&self.places[..count], &mut found[..count]);
+        let mut next = 0;
+        self.new.for_each(
+            #[inline(always)]
+            |offset| {
+                let alpha = found[next].clamp(0.0, 1.0);
+                next += 1;
+                self.alpha.0[offset] = alpha;
+                self.positive.0[offset >> 6] |= u64::from(alpha > 0.0) << (offset & 63);
+            },
+        );
     }
 }
 
