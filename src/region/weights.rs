@@ -111,7 +111,15 @@ impl RegionWeights {
                 let mut positive = LeafMask::EMPTY;
                 let (new, origin) = (unknown(id), grid.origin(id).as_dvec3());
                 let positive_here = &mut positive;
-                dispatch(RimLeaf { region, transform, origin, new, alpha, positive: positive_here, places: &mut places });
+                dispatch(RimLeaf {
+                    region,
+                    transform,
+                    origin,
+                    new,
+                    alpha,
+                    positive: positive_here,
+                    places: &mut places,
+                });
                 found.push((id, positive));
             }
             found
