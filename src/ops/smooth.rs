@@ -188,7 +188,8 @@ pub fn smooth(level_set: &mut LevelSet, params: &Smooth, run: &RunOptions) -> Re
     }
     let (until, solver) = (params.evolution.until(), params.evolution.solver(SMOOTHING));
     if let Some(what) = params.filter() {
-        return filter(level_set, what, params.evolution.iterations.unwrap_or(1), region, &solver, run);
+        let times = params.evolution.iterations.unwrap_or(1);
+        return held(level_set, region, run, |moved| filter(moved, what, times, region, &solver, run));
     }
     match params.method {
         SmoothMethod::Laplacian => evolve(level_set, &Diffusion, region, until, &solver, run),
