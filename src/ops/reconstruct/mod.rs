@@ -98,6 +98,13 @@ const MARGIN: f64 = 6.0;
 const LOOK_EVERY: u32 = 10;
 const AT_REST: f64 = 0.01;
 
+/// Part of the way to what was measured that a step takes at most, and the weight of measurements below which that does not matter.
+const RELAXATION: f64 = 0.5;
+const LEAST_STIFFNESS: f64 = 0.5;
+
+/// Voxels a unit of time that are rest.
+const RESTING: f64 = 2e-3;
+
 /// Pseudo-time after which the flow ends in any case.
 const LONGEST: f64 = 4.0;
 
@@ -270,11 +277,12 @@ fn follow(
     let (mut surface, mut dropped) = without_specks(&first, params.least_part, run)?;
     drop(first);
     let voxel_size = transform.voxel_size();
-    let forces = Forces::new(terms, transform);
-    // The stiffness of the data term: as many maps as may see a point.
-    let stiffness = 0.5 / terms.len().max(1) as f64;
+    let forces = Forces::new(terms, transform, run);
     let (mut before, mut reason) = (f64::INFINITY, "all steps were taken");
     let mut control = |moment: &Moment| {
+        if forces.has_failed() {
+            return None;
+        }
         if moment.time >= LONGEST {
             reason = "the time was reached";
             return None;
@@ -287,10 +295,13 @@ fn follow(
             }
             before = rms;
         }
-        Some(stiffness.max(0.05))
+        Some(RELAXATION / forces.take_stiffness().max(LEAST_STIFFNESS))
     };
     let bending = params.beta * voxel_size * voxel_size;
-    let report = move_surface(&mut surface, &forces, bending, params.iterations, &mut control, run)?;
+    let report = move_surface(&mut surface, &forces, bending, RESTING * voxel_size, params.iterations, &mut control, run)?;
+    if let Some(error) = forces.failure() {
+        return Err(error);
+    }
     let (cleaned, gone) = without_specks(&surface, params.least_part, run)?;
     dropped += gone;
     // Exact distances: the flow keeps them nearly.
