@@ -12,6 +12,7 @@ use crate::error::Result;
 use crate::files::input::{self, Input};
 use crate::files::output::{self, Output, Written};
 use crate::levelset::{LevelSet, Measures};
+use crate::mesh::TriangleMesh;
 use crate::ops::compare::changed_voxels;
 use crate::ops::{Arity, Entry, Outcome, Summary};
 
@@ -109,7 +110,11 @@ impl Edit {
         preview.write(before, &self.level_set, context)?;
         self.release_inputs();
         let from = self.inputs.iter().find_map(Input::from);
-        let Written { bytes, warnings, details } = output.write(&self.level_set, self.iso, from, &context.run)?;
+        let colored = self.summary.colored.as_ref().filter(|_| output.holds_colors());
+        let Written { bytes, warnings, details } = match colored {
+            Some(mesh) => output.write_mesh(TriangleMesh::clone(mesh), &context.run)?,
+            None => output.write(&self.level_set, self.iso, from, &context.run)?,
+        };
         let mut summary = self.summary.clone();
         let lost = |input: &Input| output.mesh().loss(&input.path, input.attributes?, &output.path);
         summary.warnings.extend(self.inputs.iter().filter_map(lost));

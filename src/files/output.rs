@@ -77,6 +77,11 @@ impl Output {
         self.kind == Kind::Mesh
     }
 
+    /// Whether it is a mesh whose vertices can have colours.
+    pub fn holds_colors(&self) -> bool {
+        self.is_mesh() && MeshFormat::of(&self.path).is_some_and(MeshFormat::has_attributes)
+    }
+
     /// Whether it is standard output.
     pub fn is_pipe(&self) -> bool {
         input::is_pipe(&self.path)

@@ -204,6 +204,7 @@ fn low_pass_keeps_jumps_and_edges_are_not_trusted() {
         pose: DAffine3::IDENTITY,
         width,
         height,
+        colors: Vec::new(),
         weights: vec![1.0; ranges.len()],
         ranges,
         noise: None,

@@ -10,7 +10,7 @@ use rustc_hash::FxHashMap;
 use super::NAME;
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, LEAF_DIM, LeafMask, LeafValues, Transform, offset_to_local};
-use crate::levelset::{LevelSet, background};
+use crate::levelset::{LevelSet, UnionFind, background};
 use crate::mesh::{TriangleMesh, level_set_of_mesh, level_set_to_mesh};
 use crate::pde::{LeafSurface, SurfaceSpeed, Tally};
 use crate::range::{Around, Background, Projection, RangeMap, Seen};
@@ -39,10 +39,12 @@ pub(super) struct Term<'a> {
     confidence: f64,
     /// 1 over the mean density of pixels.
     per_density: f64,
+    /// How far behind a measurement it is solid, as far as this map knows.
+    thickness: f64,
 }
 
 impl<'a> Term<'a> {
-    pub fn new(map: &'a RangeMap, width: f64, confidence: f64, mean_density: Option<f64>) -> Self {
+    pub fn new(map: &'a RangeMap, width: f64, confidence: f64, mean_density: Option<f64>, thickness: f64) -> Self {
         Self {
             map,
             to_scanner: map.pose.inverse(),
@@ -50,6 +52,8 @@ impl<'a> Term<'a> {
             width,
             confidence,
             per_density: mean_density.map_or(1.0, f64::recip),
+            // Within the window it is what was measured.
+            thickness: thickness.max(CUT * width),
         }
     }
 
@@ -61,6 +65,9 @@ impl<'a> Term<'a> {
             Seen::Surface { distance, weight, density, direction } => {
                 if distance > CUT * self.width {
                     return Look::InFront(weight);
+                }
+                if distance < -self.thickness {
+                    return Look::Beyond;
                 }
                 if distance < -CUT * self.width {
                     return Look::Behind;
@@ -84,6 +91,18 @@ impl<'a> Term<'a> {
     fn window(&self, distance: f64) -> f64 {
         let widths = distance / self.width;
         if widths.abs() < CUT { (-0.5 * widths * widths).exp() } else { 0.0 }
+    }
+
+    /// The colour that the map saw at a point of the surface with that normal, and how much it counts.
+    pub fn color(&self, xyz: DVec3, normal: DVec3) -> Option<([u8; 3], f64)> {
+        let Look::Near { weight, direction, .. } = self.at(xyz) else { return None };
+        let weight = weight * -normal.dot(direction);
+        Some((self.map.color(&self.to_scanner, xyz)?, weight)).filter(|(_, weight)| *weight > 0.0)
+    }
+
+    /// Whether the map sees a point of the surface with that normal.
+    pub fn sees(&self, xyz: DVec3, normal: DVec3) -> bool {
+        matches!(self.at(xyz), Look::Near { weight, direction, .. } if weight > 0.0 && -normal.dot(direction) > 0.0)
     }
 
     /// c·μ.
@@ -124,6 +143,8 @@ pub(super) enum Look {
     /// Far in front of what was measured, with that confidence.
     InFront(f64),
     Behind,
+    /// So far behind that it is not taken for solid.
+    Beyond,
     Near {
         distance: f64,
         weight: f64,
@@ -283,6 +304,7 @@ impl<'t, 'a> Votes<'t, 'a> {
                     Background::Unknown => votes.empty += 1,
                 },
                 Around::InFront => votes.in_front = true,
+                Around::Behind if term.thickness.is_finite() => votes.mixed.push(term),
                 Around::Behind => votes.behind += 1,
                 Around::Mixed => votes.mixed.push(term),
             }
@@ -312,6 +334,7 @@ impl<'t, 'a> Votes<'t, 'a> {
                 Look::Empty => all.surely_empty = true,
                 Look::InFront(weight) => all.in_front |= weight > 0.0,
                 Look::Behind => all.behind += 1,
+                Look::Beyond => all.empty += 1,
                 Look::Near { distance, weight, .. } => {
                     sum += weight * distance;
                     weights += weight;
@@ -459,24 +482,15 @@ pub(super) fn without_specks(level_set: &LevelSet, part: f64, run: &RunOptions) 
 
 /// The triangles of each connected piece, in the order of their first.
 fn pieces(mesh: &TriangleMesh) -> Vec<Vec<[u32; 3]>> {
-    let mut parent: Vec<u32> = (0..mesh.positions.len() as u32).collect();
-    fn root(parent: &mut [u32], mut v: u32) -> u32 {
-        while parent[v as usize] != v {
-            parent[v as usize] = parent[parent[v as usize] as usize];
-            v = parent[v as usize];
-        }
-        v
-    }
+    let joined = UnionFind::new(mesh.positions.len());
     for &[a, b, c] in &mesh.triangles {
-        for (v, w) in [(a, b), (b, c)] {
-            let (v, w) = (root(&mut parent, v), root(&mut parent, w));
-            parent[v.max(w) as usize] = v.min(w);
-        }
+        joined.join(a, b);
+        joined.join(b, c);
     }
     let mut place: FxHashMap<u32, usize> = FxHashMap::default();
     let mut pieces: Vec<Vec<[u32; 3]>> = Vec::new();
     for triangle in &mesh.triangles {
-        let root = root(&mut parent, triangle[0]);
+        let root = joined.root(triangle[0]);
         let n = *place.entry(root).or_insert_with(|| {
             pieces.push(Vec::new());
             pieces.len() - 1

@@ -16,8 +16,10 @@
 
 mod fit;
 mod forces;
+mod holes;
 
 use std::path::Path;
+use std::sync::Arc;
 
 use glam::{DVec3, IVec3};
 use schemars::JsonSchema;
@@ -28,7 +30,7 @@ use super::{Arity, Operator, Outcome, Summary, VoxelLength, WorldLength};
 use crate::error::{EditError, Result};
 use crate::grid::Transform;
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
-use crate::mesh::{Rebuild, level_set_to_mesh, rebuild};
+use crate::mesh::{Rebuild, TriangleMesh, level_set_to_mesh, rebuild};
 use crate::pde::{Moment, move_surface};
 use crate::range::{RangeMap, RangeSet};
 use crate::run::RunOptions;
@@ -40,7 +42,7 @@ const NAME: &str = "reconstruct";
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Reconstruct {
-    /// The set of maps: a .toml that describes it, a Stanford .conf or a .ptx.
+    /// The set of maps: a .toml that describes it, a Stanford .conf, a .ptx or an .e57.
     #[schemars(extend("x-kind" = "FILE"))]
     pub scans: String,
     /// Edge of a voxel in world units.
@@ -59,6 +61,9 @@ pub struct Reconstruct {
     pub iterations: u32,
     /// Standard deviation of the low pass of the ranges, in voxels; 0 for none.
     pub low_pass: VoxelLength,
+    /// How far behind what was measured it is taken for solid, in world units, where no map sees: all the way if not given. For surfaces seen from one side.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub thickness: Option<WorldLength>,
     /// Drop pieces that enclose less than this part of the largest one.
     pub least_part: f64,
     /// Rounds in which the poses of all maps but the first are improved by the surface that they made.
@@ -78,6 +83,7 @@ impl Default for Reconstruct {
             noise: None,
             iterations: 100,
             low_pass: VoxelLength::new(0.5),
+            thickness: None,
             least_part: 0.02,
             refine: 0,
             skip_missing: false,
@@ -107,6 +113,9 @@ const RESTING: f64 = 2e-3;
 
 /// Pseudo-time after which the flow ends in any case.
 const LONGEST: f64 = 4.0;
+
+/// The part of a surface that is unseen from which on something may be amiss.
+const MOSTLY_UNSEEN: f64 = 0.5;
 
 /// Steps of ICP a round.
 const ICP_STEPS: u32 = 5;
@@ -138,6 +147,11 @@ impl Operator for Reconstruct {
         let low_pass = self.low_pass.voxels(1.0);
         if !(0.0..=100.0).contains(&low_pass) {
             return refuse("low_pass", self.low_pass.to_string(), "0 or more voxels");
+        }
+        if let Some(thickness) = self.thickness
+            && !(thickness.world(1.0) > 0.0 && thickness.world(1.0).is_finite())
+        {
+            return refuse("thickness", thickness.to_string(), "a positive length");
         }
         if !(0.0..1.0).contains(&self.least_part) {
             return refuse("least_part", self.least_part.to_string(), "a part from 0 to 1");
@@ -223,7 +237,8 @@ pub fn reconstruct(set: RangeSet, params: &Reconstruct, run: &RunOptions) -> Res
             .zip(&widths)
             .map(|(map, width)| {
                 let mean = mean.filter(|_| map.mean_density().is_some());
-                Term::new(map, *width, (reference / width).powi(2).clamp(0.01, 100.0), mean)
+                let thickness = params.thickness.map_or(f64::INFINITY, |t| t.world(voxel_size));
+                Term::new(map, *width, (reference / width).powi(2).clamp(0.01, 100.0), mean, thickness)
             })
             .collect();
         let (surface, report) = follow(&terms, transform, (lo, hi), params, run)?;
@@ -237,28 +252,28 @@ pub fn reconstruct(set: RangeSet, params: &Reconstruct, run: &RunOptions) -> Res
                 .zip(&estimated)
                 .map(|(term, noise)| fit::residuals(term, &mesh, &normals, *noise))
                 .collect();
+            let holes = holes::find(&terms, &mesh, &normals);
+            if holes.part > MOSTLY_UNSEEN && params.thickness.is_none() {
+                warnings.push(format!(
+                    "{:.0} % of the surface is seen by no map: it closes off what lies behind the measurements; `thickness` keeps less of that",
+                    100.0 * holes.part
+                ));
+            }
             let mut summary =
                 Summary { steps: Some(steps), stopped_because: Some(report.2.into()), warnings, ..Summary::default() };
             summary.details.insert("maps".into(), json!(residuals));
             summary.details.insert("pieces_dropped".into(), json!(dropped));
-            summary.details.insert("unseen_part".into(), json!(unseen(&terms, &mesh.positions, &normals)));
+            summary.details.insert("unseen_part".into(), json!(holes.part));
+            summary.details.insert("unseen_area".into(), json!(holes.area));
+            summary.details.insert("holes".into(), json!(holes.largest));
+            let colors = holes::colors(&terms, &mesh, &normals);
+            summary.colored = colors.map(|colors| Arc::new(TriangleMesh { colors: Some(colors), ..mesh }));
             return Ok(Outcome { level_set: surface, summary });
         }
         made = Some(surface);
     }
     let _ = dropped;
     Ok(Outcome { level_set: LevelSet::empty(transform, params.half_width), summary: Summary::default() })
-}
-
-/// Part of the surface that no map sees: what fills holes.
-fn unseen(terms: &[Term], positions: &[DVec3], normals: &[DVec3]) -> f64 {
-    let sees = |p: DVec3, n: DVec3| {
-        terms.iter().any(|term| {
-            matches!(term.at(p), forces::Look::Near { weight, direction, .. } if weight > 0.0 && -n.dot(direction) > 0.0)
-        })
-    };
-    let count = positions.iter().zip(normals).filter(|(p, n)| !sees(**p, **n)).count();
-    count as f64 / positions.len().max(1) as f64
 }
 
 /// The first surface and its flow; steps, pieces dropped and why it ended.
