@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use clap::ArgMatches;
+use glam::DVec3;
 use serde_json::{Map, Value, json};
 
 use super::context::Context;
@@ -12,7 +13,7 @@ use crate::error::Result;
 use crate::files::input::{self, Input};
 use crate::files::output::{self, Output, Written};
 use crate::levelset::{LevelSet, Measures};
-use crate::mesh::TriangleMesh;
+use crate::mesh::transfer_attributes;
 use crate::ops::compare::changed_voxels;
 use crate::ops::{Arity, Entry, Outcome, Summary};
 
@@ -110,9 +111,13 @@ impl Edit {
         preview.write(before, &self.level_set, context)?;
         self.release_inputs();
         let from = self.inputs.iter().find_map(Input::from);
-        let colored = self.summary.colored.as_ref().filter(|_| output.holds_colors());
-        let Written { bytes, warnings, details } = match colored {
-            Some(mesh) => output.write_mesh(TriangleMesh::clone(mesh), &context.run)?,
+        let Written { bytes, warnings, details } = match &self.summary.colored {
+            Some(mesh) => {
+                let colors = |xyz: &[DVec3]| {
+                    Ok(transfer_attributes(mesh, xyz, &context.run)?.colors.unwrap_or_default())
+                };
+                output.write_colored(&self.level_set, from, &colors, &context.run)?
+            }
             None => output.write(&self.level_set, self.iso, from, &context.run)?,
         };
         let mut summary = self.summary.clone();

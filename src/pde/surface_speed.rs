@@ -169,6 +169,8 @@ struct Rest {
     /// The field at the last look, and when that was.
     before: Option<(Grid, u32, f64)>,
     leaves: LeafSet,
+    /// Whether any are left out.
+    confined: bool,
     /// The sums over them, which stay as they are.
     tally: Tally,
     /// The leaves that move from now on, if they are others than before; all of them for the inner `None`.
@@ -225,7 +227,9 @@ impl Rest {
             }
         }
         self.tally = Tally::sum(found.iter().filter(|leaf| self.leaves.contains(leaf.id)));
-        self.next = Some((!whole).then_some(part));
+        // Where all leaves move already, nothing changes.
+        self.next = (self.confined || !whole).then_some((!whole).then_some(part));
+        self.confined = !whole;
     }
 }
 
@@ -293,6 +297,16 @@ impl Motion for Moving<'_> {
         let dt = (1.0 / slowness).min(wanted).min(left);
         (self.steps, self.time) = (self.steps + 1, self.time + dt);
         Some(dt)
+    }
+
+    fn wake(&mut self, tracker: &mut Tracker) -> bool {
+        let rest = &mut self.rest;
+        if !std::mem::take(&mut rest.confined) {
+            return false;
+        }
+        (rest.leaves, rest.tally, rest.next) = (LeafSet::default(), Tally::default(), None);
+        tracker.confine(None);
+        true
     }
 
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {

@@ -11,7 +11,7 @@ use glam::{DAffine3, DQuat, DVec3};
 
 use super::files::{bytes, name};
 use super::turning::Scan;
-use super::{MOST_PIXELS, RangeSet, is_rigid};
+use super::{MOST_PIXELS, RangeMap, RangeSet, is_rigid};
 use crate::error::{EditError, Result};
 use crate::run::RunOptions;
 
@@ -104,14 +104,14 @@ impl Loose {
     }
 
     /// Points at their rows and columns.
-    fn ordered(self, name: String, pose: DAffine3) -> Option<(super::RangeMap, Option<String>)> {
+    fn ordered(self, name: String, pose: DAffine3) -> Option<(RangeMap, Option<String>)> {
         let extent = |axis: usize| {
             let of = || self.places.iter().map(|place| place[axis]);
             Some((of().min()?, of().max()?))
         };
-        let (first, last) = (extent(0)?, extent(1)?);
+        let (across, along) = (extent(0)?, extent(1)?);
         let count = |(lo, hi): (i64, i64)| hi.checked_sub(lo)?.checked_add(1).and_then(|n| usize::try_from(n).ok());
-        let (columns, rows) = (count(first)?, count(last)?);
+        let (columns, rows) = (count(across)?, count(along)?);
         if columns as f64 * rows as f64 > MOST_PIXELS {
             return None;
         }
@@ -119,7 +119,7 @@ impl Loose {
         let colored = self.colors.len() == self.points.len();
         let mut colors = vec![[0; 3]; if colored { points.len() } else { 0 }];
         for (n, (place, point)) in self.places.iter().zip(&self.points).enumerate() {
-            let at = (place[0] - first.0) as usize * rows + (place[1] - last.0) as usize;
+            let at = (place[0] - across.0) as usize * rows + (place[1] - along.0) as usize;
             points[at] = Some(*point);
             if colored {
                 colors[at] = self.colors[n];
