@@ -128,8 +128,7 @@ fn room() -> Result<()> {
         let map = RangeMap::new(format!("scanner {n}"), projection, pose, COLUMNS, ranges);
         maps.push(RangeMap { noise: Some(NOISE), ..map });
     }
-    let params =
-        Reconstruct { voxel_size: Some(WorldLength::new(0.03)), iterations: 32, ..Reconstruct::default() };
+    let params = Reconstruct { voxel_size: Some(WorldLength::new(0.03)), iterations: 32, ..Reconstruct::default() };
     let set = RangeSet { maps, ..RangeSet::default() };
     let began = Instant::now();
     let outcome = reconstruct(set, &params, &RunOptions::default())?;

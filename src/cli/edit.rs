@@ -113,9 +113,8 @@ impl Edit {
         let from = self.inputs.iter().find_map(Input::from);
         let Written { bytes, warnings, details } = match &self.summary.colored {
             Some(mesh) => {
-                let colors = |xyz: &[DVec3]| {
-                    Ok(transfer_attributes(mesh, xyz, &context.run)?.colors.unwrap_or_default())
-                };
+                let colors =
+                    |xyz: &[DVec3]| Ok(transfer_attributes(mesh, xyz, &context.run)?.colors.unwrap_or_default());
                 output.write_colored(&self.level_set, from, &colors, &context.run)?
             }
             None => output.write(&self.level_set, self.iso, from, &context.run)?,

@@ -232,7 +232,9 @@ impl Colors {
     fn at(&self, points: &[DVec3], facts: &FrameFacts, context: &Context) -> Result<Vec<[f32; 4]>> {
         let ways = self.ways.of(facts.place, points);
         let mut found = Vec::new();
-        for ((shape, points), share) in self.around(facts).into_iter().zip(&ways).zip([1.0 - facts.place.1, facts.place.1]) {
+        for ((shape, points), share) in
+            self.around(facts).into_iter().zip(&ways).zip([1.0 - facts.place.1, facts.place.1])
+        {
             if let Some(shape) = shape {
                 let colors = transfer_attributes(shape, points, &context.run)?.colors;
                 found.extend(colors.map(|colors| (colors, share as f32)));

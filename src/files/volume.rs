@@ -13,7 +13,8 @@ use crate::run::RunOptions;
 use crate::scan::Inside;
 pub use crate::vdb::FieldToWrite;
 use crate::vdb::{
-    Band, Compression, GridListing, GridToWrite, MetaItem, Precision, ReadLevelSet, VdbFile, VectorsToWrite, WriteOptions,
+    Band, Compression, GridListing, GridToWrite, MetaItem, Precision, ReadLevelSet, VdbFile, VectorsToWrite,
+    WriteOptions,
 };
 
 /// The name of a level set that had none: what Houdini and Blender call a surface.

@@ -29,7 +29,6 @@ mod violation;
 use glam::{DVec3, IVec3};
 
 pub(crate) use build::{BYTES_A_LEAF, grid_of_leaves, grid_of_parts};
-pub(crate) use union_find::UnionFind;
 pub use components::Components;
 pub use curvature::{CurvatureKind, curvature, curvature_of};
 pub use curve::curve_length;
@@ -38,6 +37,7 @@ pub use geodesic::Geodesic;
 pub use measure::Measures;
 pub use sample::{Interpolation, Sampler};
 pub use sweep::{extend_field, sweep_distance};
+pub(crate) use union_find::UnionFind;
 pub use violation::{Violation, ViolationKind};
 
 use crate::grid::{Grid, Transform};

@@ -450,7 +450,8 @@ mod tests {
             let mut level_set = ball(DVec3::new(0.3, -0.2, 0.1), 9.0);
             let mut control = |moment: &Moment| (moment.time < 30.0).then_some(0.5);
             let report =
-                move_surface(&mut level_set, &Spring { radius: 12.4 }, bending, 1e-3, 2000, &mut control, &run).unwrap();
+                move_surface(&mut level_set, &Spring { radius: 12.4 }, bending, 1e-3, 2000, &mut control, &run)
+                    .unwrap();
             assert_eq!(level_set.check(), []);
             // 12.4 − R = 2β/R. The volume is that of polygons, 0.6/R² of it less: 0.017 of the radius.
             let r = radius(&level_set);

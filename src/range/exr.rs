@@ -26,7 +26,8 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<(usize, usize, Vec<f32>)
         .non_parallel()
         .from_buffered(Cursor::new(bytes))
         .map_err(refused)?;
-    let channels = || picture.layer_data.iter().flat_map(|layer| layer.channel_data.list.iter().map(move |c| (layer, c)));
+    let channels =
+        || picture.layer_data.iter().flat_map(|layer| layer.channel_data.list.iter().map(move |c| (layer, c)));
     let is_depth = |name: &str| ["z", "depth", "depth.z", "depth.v"].contains(&name.to_lowercase().as_str());
     let named = channels().find(|(_, channel)| is_depth(&channel.name.to_string()));
     let only = || channels().next().filter(|_| channels().count() == 1);

@@ -247,7 +247,8 @@ fn e57_file(places: bool, posed: bool) -> Vec<u8> {
         }
     }
     let mut cloud = writer.add_pointcloud("cloud", records).unwrap();
-    let (rotation, translation) = (Quaternion { w: 1.0, x: 0.0, y: 0.0, z: 0.0 }, Translation { x: 7.0, y: 0.0, z: 0.0 });
+    let (rotation, translation) =
+        (Quaternion { w: 1.0, x: 0.0, y: 0.0, z: 0.0 }, Translation { x: 7.0, y: 0.0, z: 0.0 });
     cloud.set_transform(posed.then_some(Transform { rotation, translation }));
     for (column, row, p) in turned() {
         let mut values = vec![RecordValue::Double(p.x), RecordValue::Double(p.y), RecordValue::Double(p.z)];
@@ -296,7 +297,9 @@ fn e57_scans() {
 
 #[test]
 fn depths_of_exr_and_colours() {
-    use ::exr::prelude::{AnyChannel, AnyChannels, Encoding, FlatSamples, Image, Layer, LayerAttributes, WritableImage};
+    use ::exr::prelude::{
+        AnyChannel, AnyChannels, Encoding, FlatSamples, Image, Layer, LayerAttributes, WritableImage,
+    };
     let depths: Vec<f32> = (0..12).map(|n| [2.0, f32::NAN, f32::INFINITY, -1.0][if n < 4 { n } else { 0 }]).collect();
     let file = |names: &[&str]| {
         let channels = names.iter().map(|name| AnyChannel::new(*name, FlatSamples::F32(depths.clone())));
@@ -311,7 +314,8 @@ fn depths_of_exr_and_colours() {
     encoder.set_color(::png::ColorType::Rgb);
     let data: Vec<u8> = (0..36).collect();
     encoder.write_header().unwrap().write_image_data(&data).unwrap();
-    let description = "version = 1\ncamera = { focal = [2, 2], centre = [1.5, 1] }\n[[map]]\nfile = \"a.exr\"\ncolor = \"c.png\"\n";
+    let description =
+        "version = 1\ncamera = { focal = [2, 2], centre = [1.5, 1] }\n[[map]]\nfile = \"a.exr\"\ncolor = \"c.png\"\n";
     let folder = folder_with(&[
         ("set.toml", description.into()),
         ("a.exr", file(&["A", "Z"])),

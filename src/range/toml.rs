@@ -131,7 +131,11 @@ pub(super) fn read(path: &Path, run: &RunOptions) -> Result<RangeSet> {
                 set.maps.extend(scans.maps);
                 set.warnings.extend(scans.warnings);
             }
-            _ => return Err(place("a .png or .exr of depths, a .ply with a range grid, a .ptx or an .e57 is wanted".into())),
+            _ => {
+                return Err(place(
+                    "a .png or .exr of depths, a .ply with a range grid, a .ptx or an .e57 is wanted".into(),
+                ));
+            }
         }
         let common = |of: fn(&Common) -> Option<&String>| of(&entry.own).or_else(|| of(&description.common));
         let background = match common(|c| c.background.as_ref()).map(String::as_str) {

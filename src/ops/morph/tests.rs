@@ -323,37 +323,3 @@ fn curvature_holds_the_surface_back() {
     assert!((report.ends[0].0 - 0.2).abs() < 0.05 && report.warnings.iter().any(|w| w.contains("jump")), "{report:?}");
     assert_eq!(made.len(), 3);
 }
-
-#[test]
-#[ignore]
-fn scratch_spot_to_bunny() {
-    let Ok(files) = std::env::var("SCRATCH") else { return };
-    let run = RunOptions::default();
-    let files: Vec<&str> = files.split(',').collect();
-    let resolution: f64 = files[2].parse().unwrap();
-    let began = std::time::Instant::now();
-    let params = crate::mesh::MeshToLevelSet::new(1.0 / resolution);
-    let shapes = [0, 1].map(|n| {
-        let mesh = crate::mesh::read(files[n].as_ref()).unwrap().mesh;
-        crate::mesh::mesh_to_level_set(&mesh, &params, &run).unwrap().0
-    });
-    println!("read {:.2}", began.elapsed().as_secs_f64());
-    let morph = Morph::default();
-    let sequence = Sequence::new(&shapes, &morph, &run).unwrap();
-    println!("planned {:.2}", began.elapsed().as_secs_f64());
-    let places = sequence.places();
-    let mut last = 0.0;
-    let report = sequence
-        .frames(&places, &mut |n, level_set, facts| {
-            let now = began.elapsed().as_secs_f64();
-            println!("{n} {:.2} +{:.2} rms {:.4} t {:.3} shared {:.4}", now, now - last, facts.rms_voxels, facts.time, facts.shared_volume);
-            last = now;
-            if let Ok(folder) = std::env::var("SCRATCH_OUT") {
-                let grid = crate::vdb::GridToWrite { level_set: &level_set, name: Some("surface"), replaces: None };
-                crate::vdb::write(format!("{folder}/{n:04}.vdb"), &[grid], None, &crate::vdb::WriteOptions::default()).map(drop)?;
-            }
-            Ok(())
-        })
-        .unwrap();
-    println!("{} steps {:?} in {:.2}", report.steps, report.ends, began.elapsed().as_secs_f64());
-}

@@ -170,20 +170,6 @@ fn hall_maps(columns: i32, rows: i32, noise: f64) -> Vec<RangeMap> {
 }
 
 #[test]
-#[ignore]
-fn scratch_room() {
-    let maps = hall_maps(600, 270, 0.05);
-    let began = std::time::Instant::now();
-    let params =
-        Reconstruct { voxel_size: Some(WorldLength::new(0.03)), iterations: 32, beta: 2.0, ..Reconstruct::default() };
-    let (level_set, summary) = made(RangeSet { maps, ..RangeSet::default() }, &params);
-    println!("room {:.2} s, {} voxels {:?} {:?} unseen {} dropped {}", began.elapsed().as_secs_f64(), level_set.grid().active_voxels(), summary.steps, summary.stopped_because, summary.details["unseen_part"], summary.details["pieces_dropped"]);
-    let mesh = level_set_to_mesh(&level_set, 0.0, &RunOptions::default()).unwrap();
-    let near: Vec<f64> = mesh.positions.iter().map(|p| hall(*p) / 0.03).filter(|d| d.abs() < 4.0).collect();
-    println!("rms {}", (near.iter().map(|d| d * d).sum::<f64>() / near.len() as f64).sqrt());
-}
-
-#[test]
 fn a_hall_seen_by_twelve_turning_scanners() {
     let maps = hall_maps(160, 70, 0.05);
     let params =
@@ -286,7 +272,9 @@ fn thin_shells_holes_and_colours() {
     let mut set = six_maps(ball, 0.0, false);
     set.maps = vec![set.maps.remove(4)];
     let map = &mut set.maps[0];
-    map.colors = (0..map.ranges.len()).map(|at| if at % map.width < map.width / 2 { [255, 0, 0] } else { [0, 0, 255] }).collect();
+    map.colors = (0..map.ranges.len())
+        .map(|at| if at % map.width < map.width / 2 { [255, 0, 0] } else { [0, 0, 255] })
+        .collect();
     let (whole, _) = made(set.clone(), &Reconstruct { beta: 0.0, ..voxels() });
     let thickness = Some(WorldLength::new(8.0));
     let (shell, summary) = made(set, &Reconstruct { beta: 0.0, thickness, ..voxels() });
