@@ -136,7 +136,9 @@ fn write_all(
         count += 1;
     }
     if let Some(VectorsToWrite { components: [x, y, z], name }) = vectors {
-        let component = |field| to_openvdb_field(&FieldToWrite { field, name }, options);
+        // Halves are compared after rounding for grids of floats alone.
+        let whole = WriteOptions { precision: None, ..options.clone() };
+        let component = |field| to_openvdb_field(&FieldToWrite { field, name }, &whole);
         let mut add = || content.pin_mut().add_vectors(component(x)?, component(y)?, component(z)?);
         add().map_err(|e| output.error(e.what()))?;
         count += 1;
