@@ -110,15 +110,7 @@ impl Pending {
             Err(_) => None,
         };
         let suffix = target.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(PREFIX).suffix(&suffix);
-        // Temporary files are private (0600) by default; a result should be as readable as any file the user creates.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        remove_abandoned(folder_of(target));
-        let file = builder.tempfile_in(folder_of(target)).map_err(|e| failed(path, e))?;
-        // Where files cannot be locked, abandoned ones stay.
-        let _ = file.as_file().try_lock();
+        let file = temporary_in(folder_of(target), &suffix).map_err(|e| failed(path, e))?;
         let unfinished = Unfinished::new(file.path());
         Ok(Self { path: path.into(), target: target.into(), file, permissions, _unfinished: unfinished })
     }
@@ -139,6 +131,20 @@ impl Pending {
         }
         Ok(())
     }
+}
+
+/// A new temporary file in a folder.
+pub(crate) fn temporary_in(folder: &Path, suffix: &str) -> io::Result<NamedTempFile> {
+    remove_abandoned(folder);
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(PREFIX).suffix(suffix);
+    // Temporary files are private (0600) by default; a result should be as readable as any file the user creates.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let file = builder.tempfile_in(folder)?;
+    // Where files cannot be locked, abandoned ones stay.
+    let _ = file.as_file().try_lock();
+    Ok(file)
 }
 
 /// Removes the temporary files of a folder that processes left when they were killed. What cannot be removed stays.

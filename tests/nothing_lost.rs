@@ -21,7 +21,7 @@ fn code(folder: &Path, words: &[&str]) -> Option<i32> {
 const FIRST: [&str; 6] = ["shape", "sphere radius=1", "-o", "out.vdb", "--voxel-size", "0.02"];
 const SECOND: [&str; 6] = ["shape", "box size=2,2,2", "-o", "out.vdb", "--voxel-size", "0.02"];
 
-/// A level set as text: its file holds an identity of its own.
+/// What a file holds, if it is whole.
 fn content(folder: &Path) -> String {
     let words = ["info", "out.vdb", "--check", "--json"];
     let output = Command::new(env!("CARGO_BIN_EXE_vdb-edit")).args(words).current_dir(folder).output().unwrap();

@@ -49,12 +49,14 @@ impl Scan {
         if !(step > 0.0 && step.is_finite()) {
             return None;
         }
-        let (columns, rows) = ((size.x / step) as usize + 1, (size.y / step) as usize + 1);
-        let projection = Projection::Spherical { first: lo + step / 2.0, step: DVec2::splat(step) };
+        // A pixel more on the near side: angles below the first pixel's are those of a turn later.
+        let first = lo - step;
+        let (columns, rows) = ((size.x / step + 0.5) as usize + 2, (size.y / step + 0.5) as usize + 2);
+        let projection = Projection::Spherical { first, step: DVec2::splat(step) };
         let mut ranges = vec![f32::NAN; columns * rows];
         let mut colors = vec![[0; 3]; if self.colors.is_empty() { 0 } else { columns * rows }];
         for (n, angles, range) in valid() {
-            let cell = ((angles - lo) / step).as_usizevec2();
+            let cell = ((angles - first) / step + 0.5).as_usizevec2();
             let at = cell.y.min(rows - 1) * columns + cell.x.min(columns - 1);
             if ranges[at].is_nan() || (range as f32) < ranges[at] {
                 ranges[at] = range as f32;
