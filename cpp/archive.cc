@@ -775,6 +775,11 @@ void Output::carry_grid(const Archive& archive, std::size_t index)
 
 void Output::add_grid(std::unique_ptr<FloatGrid> grid) { impl->grids.push_back(grid->impl->grid); }
 
+void Output::add_vectors(std::unique_ptr<FloatGrid> x, std::unique_ptr<FloatGrid> y, std::unique_ptr<FloatGrid> z)
+{
+    impl->grids.push_back(vectors_of(*x, *y, *z));
+}
+
 void FloatGrid::carry(const Archive& archive, std::size_t index, bool with_transform)
 {
     openvdb::GridBase& source = *archive.impl->entries.at(index).grid;

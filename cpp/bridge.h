@@ -150,6 +150,8 @@ public:
     void carry_metadata(const Archive& archive);
     void carry_grid(const Archive& archive, std::size_t index);
     void add_grid(std::unique_ptr<FloatGrid> grid);
+    /// A grid of vectors whose components are these grids of one set of leaves.
+    void add_vectors(std::unique_ptr<FloatGrid> x, std::unique_ptr<FloatGrid> y, std::unique_ptr<FloatGrid> z);
     /// Writes to an existing file; every failed write is an exception.
     void write_path(rust::Slice<const std::uint8_t> path, std::uint32_t compression);
     std::unique_ptr<std::string> write_bytes(std::uint32_t compression);

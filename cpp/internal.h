@@ -63,6 +63,9 @@ inline std::unique_ptr<FloatGrid> wrap(openvdb::FloatGrid::Ptr grid)
 /// tree here, which costs 12 to 15 s of compilation.
 openvdb::FloatGrid::Ptr make_float_grid(double background);
 
+/// A grid of vectors whose components are these grids of one set of leaves, with the name, metadata and transform of the first.
+openvdb::GridBase::Ptr vectors_of(const FloatGrid& x, const FloatGrid& y, const FloatGrid& z);
+
 /// The linear transform of a row-major 4x4 matrix that acts on columns.
 openvdb::math::Transform::Ptr linear_transform(rust::Slice<const double> matrix);
 

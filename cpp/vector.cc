@@ -1,4 +1,4 @@
-// Grids of vectors, component by component: what `Leaves` says of scalar grids. Only what velocities need: no nodes.
+// Grids of vectors, component by component: what `Leaves` says of scalar grids, without nodes, and grids of three scalar ones.
 
 #include "internal.h"
 
@@ -88,6 +88,31 @@ std::unique_ptr<Leaves> component_of(const openvdb::GridBase::ConstPtr& grid, st
         return std::make_unique<Leaves>(std::make_unique<ComponentOf<openvdb::Vec3DGrid>>(doubles, c));
     }
     throw std::invalid_argument("a grid of type " + grid->type() + " holds no vectors of three numbers");
+}
+
+openvdb::GridBase::Ptr vectors_of(const FloatGrid& x, const FloatGrid& y, const FloatGrid& z)
+{
+    using TreeT = openvdb::Vec3STree;
+    using LeafT = TreeT::LeafNodeType;
+    auto grid = openvdb::gridPtrCast<openvdb::Vec3SGrid>(openvdb::GridBase::createGrid("Tree_vec3s_5_4_3"));
+    if (!grid) throw std::runtime_error("OpenVDB does not know its own vector grids");
+    const std::vector<LeafNode*>* parts[3] = {&x.impl->leaves, &y.impl->leaves, &z.impl->leaves};
+    require(parts[0]->size() == parts[1]->size() && parts[0]->size() == parts[2]->size(), "components differ in their leaves");
+    openvdb::tree::ValueAccessor<TreeT> accessor(grid->tree());
+    for (std::size_t i = 0; i < parts[0]->size(); ++i) {
+        const LeafNode* of[3] = {(*parts[0])[i], (*parts[1])[i], (*parts[2])[i]};
+        require(of[0]->origin() == of[1]->origin() && of[0]->origin() == of[2]->origin(), "components differ in their leaves");
+        auto leaf = std::make_unique<LeafT>(of[0]->origin(), openvdb::Vec3f(0.0f), false);
+        for (openvdb::Index v = 0; v < openvdb::Index(kLeafVoxels); ++v) {
+            leaf->setValueOnly(v, openvdb::Vec3f(of[0]->getValue(v), of[1]->getValue(v), of[2]->getValue(v)));
+        }
+        leaf->setValueMask(of[0]->getValueMask());
+        accessor.addLeaf(leaf.release());
+    }
+    const openvdb::FloatGrid& like = *x.impl->grid;
+    for (auto it = like.beginMeta(); it != like.endMeta(); ++it) grid->insertMeta(it->first, *it->second);
+    grid->setTransform(like.transform().copy());
+    return grid;
 }
 
 } // namespace vdb_edit

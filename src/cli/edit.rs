@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use clap::ArgMatches;
+use glam::DVec3;
 use serde_json::{Map, Value, json};
 
 use super::context::Context;
@@ -12,6 +13,7 @@ use crate::error::Result;
 use crate::files::input::{self, Input};
 use crate::files::output::{self, Output, Written};
 use crate::levelset::{LevelSet, Measures};
+use crate::mesh::transfer_attributes;
 use crate::ops::compare::changed_voxels;
 use crate::ops::{Arity, Entry, Outcome, Summary};
 
@@ -109,7 +111,14 @@ impl Edit {
         preview.write(before, &self.level_set, context)?;
         self.release_inputs();
         let from = self.inputs.iter().find_map(Input::from);
-        let Written { bytes, warnings, details } = output.write(&self.level_set, self.iso, from, &context.run)?;
+        let Written { bytes, warnings, details } = match &self.summary.colored {
+            Some(mesh) => {
+                let colors =
+                    |xyz: &[DVec3]| Ok(transfer_attributes(mesh, xyz, &context.run)?.colors.unwrap_or_default());
+                output.write_colored(&self.level_set, from, &colors, &context.run)?
+            }
+            None => output.write(&self.level_set, self.iso, from, &context.run)?,
+        };
         let mut summary = self.summary.clone();
         let lost = |input: &Input| output.mesh().loss(&input.path, input.attributes?, &output.path);
         summary.warnings.extend(self.inputs.iter().filter_map(lost));

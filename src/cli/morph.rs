@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use clap::{Arg, ArgAction, ArgMatches, Command};
+use glam::DVec3;
 use serde_json::{Map, Value, json};
 
 use super::context::Context;
@@ -15,8 +16,8 @@ use crate::files::input;
 use crate::files::mesh_output::MeshParams;
 use crate::files::output::{self, Output};
 use crate::levelset::LevelSet;
-use crate::mesh::{MeshFormat, TriangleMesh, level_set_to_mesh, transfer_attributes};
-use crate::ops::morph::{Align, FrameFacts, Morph, Sequence};
+use crate::mesh::{TriangleMesh, transfer_attributes};
+use crate::ops::morph::{FrameFacts, Morph, Sequence, Ways};
 use crate::ops::{Entry, find, parse};
 use crate::render::{ColorBy, Frame, Image, RenderOptions, render as draw};
 
@@ -118,7 +119,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     };
     let from = inputs.iter().find_map(|input| input.from());
     let check = args::flag(matches, "check");
-    let colors = Colors::of(&paths, &planned, &params, &mut warnings)?;
+    let colors = Colors::of(&paths, &planned, sequence.ways())?;
     let (mut facts, mut strip, mut moving, mut bytes) = (Vec::new(), Vec::new(), Vec::new(), 0);
     let last = planned.len() - 1;
     let mut first_and_last = [None, None];
@@ -138,9 +139,9 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
                 output::verify(VERB.name, &level_set)?;
             }
             match &frame.output {
-                Some(output) if output.is_mesh() && colors.carries(&frame_facts) => {
-                    let mesh = colors.painted(&level_set, &frame_facts, context)?;
-                    bytes += output.write_mesh(mesh, &context.run)?.bytes.unwrap_or(0);
+                Some(output) if colors.carries(&frame_facts) => {
+                    let of = |points: &[DVec3]| colors.at(points, &frame_facts, context);
+                    bytes += output.write_colored(&level_set, from, &of, &context.run)?.bytes.unwrap_or(0);
                 }
                 Some(output) => {
                     let written = output.write(&level_set, 0.0, from, &context.run)?;
@@ -200,36 +201,25 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
 }
 
 /// The colours of the shapes, where they came as meshes with colours.
-struct Colors(Vec<Option<TriangleMesh>>);
+struct Colors {
+    shapes: Vec<Option<TriangleMesh>>,
+    ways: Ways,
+}
 
 impl Colors {
-    /// Those that the frames can hold. Shapes that are laid over each other by a transformation keep none: colours are found at the closest points in the world.
-    fn of(paths: &[PathBuf], planned: &[Planned], params: &Morph, warnings: &mut Vec<String>) -> Result<Self> {
-        let holds = planned.first().is_some_and(|frame| {
-            MeshFormat::of(&frame.path).is_some_and(MeshFormat::has_attributes) && frame.output.is_some()
-        });
-        if !holds {
-            return Ok(Self(Vec::new()));
-        }
-        let mut colors = Vec::new();
-        for path in paths {
-            let mesh = match input::is_volume(path) {
-                true => None,
-                false => Some(input::read_mesh(path, &mut Vec::new())?).filter(|mesh| mesh.colors.is_some()),
-            };
-            colors.push(mesh);
-        }
-        let posed = params.align != Align::None || params.transform.is_some() || params.landmarks.is_some();
-        if posed && colors.iter().any(Option::is_some) {
-            warnings.push("colours are lost: they are not carried through a transformation".into());
-            colors.clear();
-        }
-        Ok(Self(colors))
+    /// Those that the frames can hold.
+    fn of(paths: &[PathBuf], planned: &[Planned], ways: Ways) -> Result<Self> {
+        let holds = planned.first().and_then(|frame| frame.output.as_ref()).is_some_and(Output::holds_colors);
+        let of_shape = |path: &PathBuf| match holds && !input::is_volume(path) {
+            true => Ok(Some(input::read_mesh(path, &mut Vec::new())?).filter(|mesh| mesh.colors.is_some())),
+            false => Ok(None),
+        };
+        Ok(Self { shapes: paths.iter().map(of_shape).collect::<Result<_>>()?, ways })
     }
 
     fn around(&self, facts: &FrameFacts) -> [Option<&TriangleMesh>; 2] {
         let leg = facts.place.0;
-        [self.0.get(leg).and_then(Option::as_ref), self.0.get(leg + 1).and_then(Option::as_ref)]
+        [self.shapes.get(leg).and_then(Option::as_ref), self.shapes.get(leg + 1).and_then(Option::as_ref)]
     }
 
     /// Whether a frame has colours.
@@ -237,23 +227,24 @@ impl Colors {
         self.around(facts).iter().any(Option::is_some)
     }
 
-    /// The mesh of a frame: each vertex has the colours of the closest points of both shapes, mixed as far as the frame has gone (Breen, Mauch &
-    /// Whitaker 2000), or that of the one that has any.
-    fn painted(&self, level_set: &LevelSet, facts: &FrameFacts, context: &Context) -> Result<TriangleMesh> {
-        let mut mesh = level_set_to_mesh(level_set, 0.0, &context.run)?;
+    /// The colours of points of a frame: those of the closest points of both shapes, mixed as far as the frame has gone (Breen, Mauch & Whitaker 2000), or that
+    /// of the one that has any.
+    fn at(&self, points: &[DVec3], facts: &FrameFacts, context: &Context) -> Result<Vec<[f32; 4]>> {
+        let ways = self.ways.of(facts.place, points);
         let mut found = Vec::new();
-        for (source, share) in self.around(facts).into_iter().zip([1.0 - facts.place.1, facts.place.1]) {
-            if let Some(source) = source {
-                let colors = transfer_attributes(source, &mesh.positions, &context.run)?.colors;
+        for ((shape, points), share) in
+            self.around(facts).into_iter().zip(&ways).zip([1.0 - facts.place.1, facts.place.1])
+        {
+            if let Some(shape) = shape {
+                let colors = transfer_attributes(shape, points, &context.run)?.colors;
                 found.extend(colors.map(|colors| (colors, share as f32)));
             }
         }
-        mesh.colors = match &found[..] {
-            [(a, share), (b, _)] => Some(a.iter().zip(b).map(|(a, b)| mixed(*a, *b, *share)).collect()),
-            [(only, _)] => Some(only.clone()),
-            _ => None,
-        };
-        Ok(mesh)
+        Ok(match &found[..] {
+            [(a, share), (b, _)] => a.iter().zip(b).map(|(a, b)| mixed(*a, *b, *share)).collect(),
+            [(only, _)] => only.clone(),
+            _ => Vec::new(),
+        })
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use glam::DVec3;
 use serde_json::{Map, Value};
 
 use super::input;
@@ -9,8 +10,8 @@ use super::mesh_output::{MeshOptions, MeshParams};
 use super::volume::{self, Volume};
 use crate::atomic;
 use crate::error::{EditError, Result};
-use crate::levelset::LevelSet;
-use crate::mesh::{MeshFormat, TriangleMesh};
+use crate::levelset::{Field, LevelSet};
+use crate::mesh::{MeshFormat, TriangleMesh, level_set_to_mesh};
 use crate::run::RunOptions;
 
 /// A file to be written.
@@ -77,6 +78,11 @@ impl Output {
         self.kind == Kind::Mesh
     }
 
+    /// Whether the file can hold colours.
+    pub fn holds_colors(&self) -> bool {
+        !self.is_mesh() || MeshFormat::of(&self.path).is_some_and(MeshFormat::has_attributes)
+    }
+
     /// Whether it is standard output.
     pub fn is_pipe(&self) -> bool {
         input::is_pipe(&self.path)
@@ -94,10 +100,36 @@ impl Output {
         run.check("writing")?;
         match self.kind {
             Kind::Volume => {
-                let (bytes, warnings) = volume::write(&self.path, level_set, from, &self.options)?;
+                let (bytes, warnings) = volume::write(&self.path, level_set, None, from, &self.options)?;
                 Ok(Written { bytes: Some(bytes), warnings, ..Written::default() })
             }
             Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, iso, run),
+        }
+    }
+
+    /// Writes a level set with colours, linear, that are found for positions of the world: those of the vertices of a mesh, or those of the voxels of the band, as a
+    /// grid `Cd`. Without them where the file holds none.
+    pub fn write_colored(
+        &self,
+        level_set: &LevelSet,
+        from: Option<(&Volume, Option<usize>)>,
+        colors: &dyn Fn(&[DVec3]) -> Result<Vec<[f32; 4]>>,
+        run: &RunOptions,
+    ) -> Result<Written> {
+        run.check("writing")?;
+        match self.kind {
+            Kind::Volume => {
+                let rgb = |xyz: &[DVec3]| Ok(colors(xyz)?.into_iter().map(|[r, g, b, _]| [r, g, b]).collect());
+                let fields = Field::three_of(level_set, rgb)?;
+                let (bytes, warnings) = volume::write(&self.path, level_set, Some(&fields), from, &self.options)?;
+                Ok(Written { bytes: Some(bytes), warnings, ..Written::default() })
+            }
+            Kind::Mesh if self.holds_colors() => {
+                let mut mesh = level_set_to_mesh(level_set, 0.0, run)?;
+                mesh.colors = Some(colors(&mesh.positions)?);
+                self.mesh.write_mesh(&self.path, mesh, run)
+            }
+            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, 0.0, run),
         }
     }
 

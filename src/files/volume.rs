@@ -8,16 +8,20 @@ use serde_json::{Map, Value, json};
 pub use super::grids::{BandState, Choice, Description, GridDescription, VolumeGrid};
 use super::output::VolumeOptions;
 use crate::error::{EditError, Result};
-use crate::levelset::LevelSet;
+use crate::levelset::{Field, LevelSet};
 use crate::run::RunOptions;
 use crate::scan::Inside;
 pub use crate::vdb::FieldToWrite;
 use crate::vdb::{
-    Band, Compression, GridListing, GridToWrite, MetaItem, Precision, ReadLevelSet, VdbFile, WriteOptions,
+    Band, Compression, GridListing, GridToWrite, MetaItem, Precision, ReadLevelSet, VdbFile, VectorsToWrite,
+    WriteOptions,
 };
 
 /// The name of a level set that had none: what Houdini and Blender call a surface.
 const NEW_NAME: &str = "surface";
+
+/// The name of colours: what Houdini calls those of points.
+const COLORS: &str = "Cd";
 
 /// An open `.vdb` file.
 pub struct Volume {
@@ -104,6 +108,7 @@ fn band_state(read: &ReadLevelSet) -> BandState {
 pub fn write(
     path: &Path,
     level_set: &LevelSet,
+    colors: Option<&[Field; 3]>,
     from: Option<(&Volume, Option<usize>)>,
     options: &VolumeOptions,
 ) -> Result<(u64, Vec<String>)> {
@@ -118,7 +123,14 @@ pub fn write(
     };
     let index = from.and_then(|(_, index)| index);
     let grid = GridToWrite { level_set, name: index.is_none().then_some(NEW_NAME), replaces: index };
-    let report = crate::vdb::write(path, &[grid], from.map(|(volume, _)| &volume.file), &options)?;
+    let input = from.map(|(volume, _)| &volume.file);
+    let report = match colors {
+        Some(components) => {
+            let colors = VectorsToWrite { components, name: COLORS };
+            crate::vdb::write_with_vectors(path, &[grid], colors, input, &options)?
+        }
+        None => crate::vdb::write(path, &[grid], input, &options)?,
+    };
     Ok((report.bytes, report.warnings))
 }
 

@@ -56,6 +56,7 @@ impl Volume {
 pub fn write(
     path: &Path,
     _: &LevelSet,
+    _: Option<&[Field; 3]>,
     _: Option<(&Volume, Option<usize>)>,
     _: &VolumeOptions,
 ) -> Result<(u64, Vec<String>)> {

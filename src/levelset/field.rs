@@ -1,8 +1,13 @@
 //! A number at each voxel of a band: what is computed of a level set and is no distance.
 
-use glam::{DVec3, IVec3};
+use std::ops::Range;
 
-use crate::grid::{Accessor, Grid, MAX_COORD, Transform};
+use glam::{DVec3, IVec3};
+use rustc_hash::FxHashMap;
+
+use super::LevelSet;
+use crate::error::Result;
+use crate::grid::{Accessor, Grid, LeafId, MAX_COORD, Transform, offset_to_local};
 
 /// A float a voxel, beside a level set: active where it has a value, 0 elsewhere. Cheap to clone.
 #[derive(Clone)]
@@ -15,6 +20,37 @@ impl Field {
     /// A field of a grid whose background and inactive voxels are 0 ([`Grid::zeroed`]).
     pub(crate) fn new(grid: Grid, transform: Transform) -> Self {
         Self { grid, transform }
+    }
+
+    /// Three numbers for each active voxel of a level set, found for the world positions of those of a leaf, as a field each.
+    pub(crate) fn three_of(
+        level_set: &LevelSet,
+        find: impl Fn(&[DVec3]) -> Result<Vec<[f32; 3]>>,
+    ) -> Result<[Self; 3]> {
+        let (grid, transform) = (level_set.grid(), *level_set.transform());
+        let voxels: Vec<(LeafId, usize)> =
+            grid.leaves().iter().flat_map(|&id| grid.mask(id).iter().map(move |offset| (id, offset))).collect();
+        let xyz: Vec<DVec3> = voxels
+            .iter()
+            .map(|&(id, offset)| transform.voxel_to_world(grid.origin(id) + offset_to_local(offset)))
+            .collect();
+        let found = find(&xyz)?;
+        let mut of_leaf: FxHashMap<LeafId, Range<usize>> = FxHashMap::default();
+        for (n, (id, _)) in voxels.iter().enumerate() {
+            of_leaf.entry(*id).or_insert(n..n).end = n + 1;
+        }
+        let component = |axis: usize| {
+            let mut component = grid.zeroed();
+            component.update_all(|id, values, _| {
+                for n in of_leaf.get(&id).cloned().into_iter().flatten() {
+                    if let Some(numbers) = found.get(n) {
+                        values.0[voxels[n].1] = numbers[axis];
+                    }
+                }
+            });
+            Self::new(component, transform)
+        };
+        Ok([component(0), component(1), component(2)])
     }
 
     /// Values and active voxels.

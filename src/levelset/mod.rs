@@ -37,6 +37,7 @@ pub use geodesic::Geodesic;
 pub use measure::Measures;
 pub use sample::{Interpolation, Sampler};
 pub use sweep::{extend_field, sweep_distance};
+pub(crate) use union_find::UnionFind;
 pub use violation::{Violation, ViolationKind};
 
 use crate::grid::{Grid, Transform};

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 /// Sets of the numbers 0..n. A larger root is always linked below a smaller one, so links never form a cycle, and the
 /// sets do not depend on the order in which threads join them.
-pub(super) struct UnionFind {
+pub(crate) struct UnionFind {
     parents: Vec<AtomicU32>,
 }
 

@@ -29,6 +29,7 @@ pub use attributes::{Attributes, transfer_attributes};
 pub use bezier::BezierPatches;
 pub use bvh::{Bvh, Hit};
 pub(crate) use closest::closest_on_triangle;
+pub(crate) use files::linear_from_srgb8;
 pub use files::{MeshFormat, ReadMesh, read, write, write_quads, write_to};
 pub use findings::MeshFindings;
 pub use from_levelset::level_set_to_mesh;

@@ -1,5 +1,7 @@
 //! The list of operators, and what the command line needs to know of each.
 
+use std::sync::Arc;
+
 use schemars::{JsonSchema, Schema, schema_for};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -7,6 +9,7 @@ use serde_json::{Map, Value};
 
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
+use crate::mesh::TriangleMesh;
 use crate::pde::{Report, StopReason};
 use crate::run::RunOptions;
 use crate::spec::suggest;
@@ -33,6 +36,9 @@ pub struct Summary {
     /// Why a flow ended.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stopped_because: Option<String>,
+    /// The surface with colours, where the operator found any: for files that hold them.
+    #[serde(skip)]
+    pub colored: Option<Arc<TriangleMesh>>,
     /// What the user should know: repairs, resampling, parameters that did nothing.
     pub warnings: Vec<String>,
     /// Anything else worth telling, by name.

@@ -1,4 +1,4 @@
-//! Which voxels a step may write: everything, or what a region touches.
+//! Which voxels a step may write: everything, what a region touches, or some leaves.
 
 use crate::grid::{Grid, LeafId, LeafMask, LeafSet, Paged, Transform};
 use crate::region::{Region, RegionWeights};
@@ -10,7 +10,8 @@ pub(super) struct Domain {
 }
 
 struct Local {
-    weights: RegionWeights,
+    /// Of a region; where only leaves are listed, whatever is not frozen has weight 1.
+    weights: Option<RegionWeights>,
     /// Of the leaves worked on, the voxels that were active at the start and have weight 0.
     frozen: Paged<LeafMask>,
 }
@@ -27,7 +28,13 @@ impl Domain {
         frozen.par_update(weights.leaves(), |id, frozen: &mut LeafMask| {
             *frozen = grid.mask(id).zip(weights.positive(id), |active, moves| active & !moves);
         });
-        Self { leaves: weights.leaves().clone(), local: Some(Local { weights, frozen }) }
+        Self { leaves: weights.leaves().clone(), local: Some(Local { weights: Some(weights), frozen }) }
+    }
+
+    /// Some leaves of a grid, and new ones beside them; what is active in the others now is frozen.
+    pub fn part(grid: &Grid, leaves: LeafSet) -> Self {
+        let frozen = Paged::filled(grid.value_pages().page_count(), LeafMask::EMPTY);
+        Self { leaves, local: Some(Local { weights: None, frozen }) }
     }
 
     /// The leaves to work on.
@@ -42,13 +49,13 @@ impl Domain {
 
     /// The weights, where there is a region.
     pub fn weights(&self) -> Option<&RegionWeights> {
-        self.local.as_ref().map(|l| &l.weights)
+        self.local.as_ref().and_then(|l| l.weights.as_ref())
     }
 
     /// Looks up the weights of voxels that became active.
     pub fn weigh(&mut self, grid: &Grid, transform: &Transform, region: &dyn Region) {
-        if let Some(local) = &mut self.local {
-            local.weights.evaluate(grid, transform, region, &self.leaves);
+        if let Some(weights) = self.local.as_mut().and_then(|local| local.weights.as_mut()) {
+            weights.evaluate(grid, transform, region, &self.leaves);
         }
     }
 
@@ -57,7 +64,8 @@ impl Domain {
     pub fn moving(&self, id: LeafId, active: LeafMask) -> LeafMask {
         match &self.local {
             None => active,
-            Some(local) => active.zip(local.weights.positive(id), |a, moves| a & moves),
+            Some(Local { weights: Some(weights), .. }) => active.zip(weights.positive(id), |a, moves| a & moves),
+            Some(Local { weights: None, frozen }) => active.zip(*frozen.get(id), |a, frozen| a & !frozen),
         }
     }
 
@@ -78,7 +86,7 @@ impl Domain {
         if let Some(local) = &mut self.local {
             let pages = grid.value_pages().page_count();
             local.frozen.grow(pages, LeafMask::EMPTY);
-            local.weights.grow(pages);
+            local.weights.iter_mut().for_each(|weights| weights.grow(pages));
             leaves.iter().for_each(|&id| *local.frozen.get_mut(id) = LeafMask::EMPTY);
         }
     }
@@ -99,7 +107,7 @@ impl Domain {
             self.leaves.remove(id);
         }
         if let Some(local) = &mut self.local {
-            local.weights.forget(leaves);
+            local.weights.iter_mut().for_each(|weights| weights.forget(leaves));
         }
     }
 }

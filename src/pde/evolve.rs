@@ -57,6 +57,11 @@ pub(super) trait Motion {
 
     /// Moves the surface by that time step.
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()>;
+
+    /// Lets voxels move again that it had left out, when none is left that moves. Says whether there were any.
+    fn wake(&mut self, _: &mut Tracker) -> bool {
+        false
+    }
 }
 
 /// The time loop: steps and tracks until it is time to stop.
@@ -75,6 +80,9 @@ pub(super) fn drive(tracker: &mut Tracker, motion: &mut impl Motion, until: Unti
         stopped: if end.is_finite() { StopReason::Time } else { StopReason::Iterations },
     };
     while report.steps < most && report.time < end {
+        if report.voxels == 0 && motion.wake(tracker) {
+            report.voxels = tracker.moving_voxels();
+        }
         if report.voxels == 0 {
             report.stopped = StopReason::NothingLeft;
             break;

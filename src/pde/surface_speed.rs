@@ -8,6 +8,9 @@
 //! Normals are central differences; |∇φ| is Godunov's of first order for F, central for the curvature. Near rest the scheme of |∇φ| does not matter, since F
 //! vanishes; that of renormalisation does, since each track shifts the surface: HJ-WENO5 there.
 //! 1/dt = 1/dt_F + 1/dt_κ with dt_F = ½h / max|F|, dt_κ = 0.9 h²/(6β).
+//!
+//! Most of a surface arrives long before its last part. So every few steps the leaves whose surface has not moved since the last look are left out until a
+//! leaf beside them moves.
 
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 use glam::{DVec3, IVec3};
@@ -18,7 +21,7 @@ use super::step::{LeafKernel, Rows, Target};
 use super::tracker::Tracker;
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::Result;
-use crate::grid::{Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged, offset_to_local};
+use crate::grid::{Grid, LeafId, LeafMask, LeafSet, LeafValues, PageLeaves, Paged, offset_to_local};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 use crate::stencil::curvature::mean_curvature;
@@ -31,6 +34,15 @@ const COURANT: f64 = 0.5;
 
 /// Below this part of a voxel a unit of time, nothing moves.
 const AT_REST: f32 = 1e-6;
+
+/// Steps between two looks at which leaves rest. In that time nothing crosses the ring of leaves around those that move.
+const SURVEY_EVERY: u32 = 10;
+
+/// Parts of a voxel: what a surface at rest moves at most between two looks, whatever the time, since renormalisation shifts it to and fro.
+const SMALLEST_MOVE: f64 = 3e-4;
+
+/// The part of the leaves that is worth leaving the others out.
+const WORTH_A_PART: f64 = 0.8;
 
 /// What moves a surface.
 pub trait SurfaceSpeed: Sync {
@@ -50,6 +62,10 @@ pub struct Tally {
 }
 
 impl Tally {
+    fn sum<'a>(tallies: impl Iterator<Item = &'a OfLeaf>) -> Self {
+        tallies.fold(Self::default(), |sum, leaf| sum.add(leaf.tally))
+    }
+
     fn add(self, other: Self) -> Self {
         Self { count: self.count + other.count, squares: self.squares + other.squares, fall: self.fall + other.fall }
     }
@@ -64,6 +80,8 @@ impl Tally {
 pub struct LeafSurface<'a> {
     /// The leaf's first voxel.
     pub origin: IVec3,
+    /// The value of voxels beyond the band, world units.
+    pub background: f32,
     moving: LeafMask,
     /// Unit normals in index axes.
     normal: &'a [LeafValues; 3],
@@ -78,6 +96,8 @@ pub struct Foot {
     pub offset: usize,
     /// The surface point.
     pub point: DVec3,
+    /// How far along the normal the voxel is from it; negative inside.
+    pub depth: f64,
     /// The outward normal; 0 where the field is flat.
     pub normal: DVec3,
     /// Whether the voxel is less than half a voxel away: these stand for the surface.
@@ -92,7 +112,7 @@ impl LeafSurface<'_> {
             let normal = DVec3::new(x.0[offset].into(), y.0[offset].into(), z.0[offset].into());
             let depth = f64::from(self.depth.0[offset]);
             let ijk = (self.origin + offset_to_local(offset)).as_dvec3();
-            Foot { offset, point: ijk - normal * depth, normal, beside: depth.abs() < 0.5 }
+            Foot { offset, point: ijk - normal * depth, depth, normal, beside: depth.abs() < 0.5 }
         })
     }
 }
@@ -109,18 +129,22 @@ pub struct Moment<'a> {
     pub tally: Tally,
 }
 
-/// Moves a level set by a speed at the surface and β times twice its curvature (`bending`, world²), for at most `most` steps. `control` says how long the
-/// next step may be at most, or that there is to be none.
+/// Moves a level set by a speed at the surface and β times twice its curvature (`bending`, world²), for at most `most` steps. What is slower than
+/// `at_rest` (world units a unit of time) rests. `control` says how long the next step may be at most, or that there is to be none.
 pub fn move_surface(
     level_set: &mut LevelSet,
     speed: &dyn SurfaceSpeed,
     bending: f64,
+    at_rest: f64,
     most: u32,
     control: &mut dyn FnMut(&Moment) -> Option<f64>,
     run: &RunOptions,
 ) -> Result<Report> {
+    let bytes = 3 * level_set.grid().bytes();
+    run.reserve("moving a surface", bytes, "take a larger voxel size")?;
     let mut tracker = Tracker::new(level_set, None, SOLVER, run);
-    let mut motion = Moving { source: speed, bending, control, speed: Paged::default(), steps: 0, time: 0.0 };
+    let rest = Rest { slowest: at_rest, ..Rest::default() };
+    let mut motion = Moving { source: speed, bending, control, speed: Paged::default(), steps: 0, time: 0.0, rest };
     drive(&mut tracker, &mut motion, Until::Iterations(most))
 }
 
@@ -134,42 +158,137 @@ struct Moving<'a> {
     speed: Paged<LeafValues>,
     steps: u32,
     time: f64,
+    rest: Rest,
+}
+
+/// The leaves that are left out because nothing moves there.
+#[derive(Default)]
+struct Rest {
+    /// World units a unit of time.
+    slowest: f64,
+    /// The field at the last look, and when that was.
+    before: Option<(Grid, u32, f64)>,
+    leaves: LeafSet,
+    /// Whether any are left out.
+    confined: bool,
+    /// The sums over them, which stay as they are.
+    tally: Tally,
+    /// The leaves that move from now on, if they are others than before; all of them for the inner `None`.
+    next: Option<Option<LeafSet>>,
+}
+
+/// What is found in a leaf.
+struct OfLeaf {
+    id: LeafId,
+    origin: IVec3,
+    tally: Tally,
+    /// Largest |F|.
+    fastest: f32,
+    /// How far φ near the surface has moved since the last look; infinite for a leaf that was not there.
+    moved: f32,
+}
+
+impl Rest {
+    /// How far a leaf at rest may have moved at most, if it is time for a look.
+    fn limit(&self, steps: u32, time: f64, voxel_size: f64) -> Option<f64> {
+        let (_, then, begun) = self.before.as_ref()?;
+        let passed = (self.slowest * (time - begun)).max(SMALLEST_MOVE * voxel_size);
+        (steps >= then + SURVEY_EVERY).then_some(passed)
+    }
+
+    /// How far φ of a leaf has moved near the surface.
+    fn moved(&self, grid: &Grid, id: LeafId) -> f32 {
+        let Some((before, ..)) = &self.before else { return f32::INFINITY };
+        let then = before.find(grid.origin(id));
+        if then.is_sentinel() {
+            return f32::INFINITY;
+        }
+        let near = 0.5 * grid.background();
+        let (now, then) = (&grid.values(id).0, &before.values(then).0);
+        let moved = grid.mask(id).iter().filter(|&at| now[at].abs() < near).map(|at| (now[at] - then[at]).abs());
+        moved.fold(0.0, f32::max)
+    }
+
+    /// Looks which leaves have come to rest; `found` is of all of them.
+    fn survey(&mut self, grid: &Grid, found: &[OfLeaf], limit: f64) {
+        let awake = found.iter().filter(|leaf| f64::from(leaf.moved) > limit);
+        let around = grid.neighbours();
+        let mut part = LeafSet::default();
+        for leaf in awake {
+            for &id in around[leaf.id.index()].iter().filter(|id| !id.is_sentinel()) {
+                part.insert(id);
+            }
+        }
+        let whole = part.len() as f64 > WORTH_A_PART * found.len() as f64;
+        self.leaves = LeafSet::default();
+        if !whole {
+            for leaf in found.iter().filter(|leaf| !part.contains(leaf.id)) {
+                self.leaves.insert(leaf.id);
+            }
+        }
+        self.tally = Tally::sum(found.iter().filter(|leaf| self.leaves.contains(leaf.id)));
+        // Where all leaves move already, nothing changes.
+        self.next = (self.confined || !whole).then_some((!whole).then_some(part));
+        self.confined = !whole;
+    }
 }
 
 impl Motion for Moving<'_> {
     fn prepare(&mut self, tracker: &Tracker, left: f64) -> Option<f64> {
-        let pages = tracker.grid().value_pages().page_count();
+        let grid = tracker.grid();
+        let voxel_size = f64::from(tracker.voxel_size());
+        let pages = grid.value_pages().page_count();
         self.speed.truncate(pages);
         // Voxels are written before they are read.
         self.speed.grow_unwritten(pages);
-        let source = self.source;
-        let found = self.speed.par_update_pages(tracker.domain.leaves(), |leaves, speed| {
-            let mut tallies = Vec::new();
-            let mut fastest = 0f32;
+        let (source, rest) = (self.source, &self.rest);
+        let limit = rest.limit(self.steps, self.time, voxel_size);
+        let leaves = if limit.is_some() { grid.leaf_set() } else { tracker.domain.leaves() };
+        let found = self.speed.par_update_pages(leaves, |leaves, speed| {
+            let mut found = Vec::new();
             if !tracker.run.is_cancelled() {
                 let mut normal = [LeafValues::default(), LeafValues::default(), LeafValues::default()];
                 let mut depth = LeafValues::default();
-                let grid = tracker.grid();
                 let mut halo = FaceHalo::new();
                 leaves.for_each(|id| {
-                    let moving = tracker.domain.moving(id, grid.mask(id));
+                    let moving = match limit {
+                        Some(_) => grid.mask(id),
+                        None => tracker.domain.moving(id, grid.mask(id)),
+                    };
                     dispatch(Feet { tracker, id, moving, halo: &mut halo, normal: &mut normal, depth: &mut depth });
-                    let leaf = LeafSurface { origin: grid.origin(id), moving, normal: &normal, depth: &depth };
+                    let leaf = LeafSurface {
+                        origin: grid.origin(id),
+                        background: grid.background(),
+                        moving,
+                        normal: &normal,
+                        depth: &depth,
+                    };
                     let speed = &mut speed[PageLeaves::slot(id)];
-                    tallies.push((grid.origin(id), source.of_leaf(&leaf, speed)));
-                    fastest = moving.iter().map(|at| speed.0[at].abs()).fold(fastest, f32::max);
+                    let tally = source.of_leaf(&leaf, speed);
+                    let fastest = moving.iter().map(|at| speed.0[at].abs()).fold(0.0, f32::max);
+                    let moved = if limit.is_some() { rest.moved(grid, id) } else { 0.0 };
+                    found.push(OfLeaf { id, origin: leaf.origin, tally, fastest, moved });
                 });
             }
-            (tallies, fastest)
+            found
         });
         // Slots depend on the history of a grid, the order of origins does not.
-        let mut tallies: Vec<_> = found.iter().flat_map(|(tallies, _)| tallies).collect();
-        tallies.sort_unstable_by_key(|(o, _)| (o.x, o.y, o.z));
-        let tally = tallies.into_iter().fold(Tally::default(), |sum, (_, tally)| sum.add(*tally));
-        let fastest = found.iter().map(|(_, fastest)| *fastest).fold(0.0, f32::max);
-        let moment = Moment { grid: tracker.grid(), steps: self.steps, time: self.time, tally };
+        let mut found: Vec<OfLeaf> = found.into_iter().flatten().collect();
+        found.sort_unstable_by_key(|leaf| (leaf.origin.x, leaf.origin.y, leaf.origin.z));
+        if let Some(limit) = limit {
+            self.rest.survey(grid, &found, limit);
+        }
+        if limit.is_some() || self.rest.before.is_none() {
+            self.rest.before = Some((grid.clone(), self.steps, self.time));
+        }
+        found.retain(|leaf| !self.rest.leaves.contains(leaf.id));
+        let tally = Tally::sum(found.iter()).add(self.rest.tally);
+        let fastest = found.iter().map(|leaf| leaf.fastest).fold(0.0, f32::max);
+        let moment = Moment { grid, steps: self.steps, time: self.time, tally };
         let wanted = (self.control)(&moment)?;
-        let voxel_size = f64::from(tracker.voxel_size());
+        if found.is_empty() {
+            return None;
+        }
         if self.bending == 0.0 && fastest <= AT_REST * tracker.voxel_size() {
             return None;
         }
@@ -180,7 +299,20 @@ impl Motion for Moving<'_> {
         Some(dt)
     }
 
+    fn wake(&mut self, tracker: &mut Tracker) -> bool {
+        let rest = &mut self.rest;
+        if !std::mem::take(&mut rest.confined) {
+            return false;
+        }
+        (rest.leaves, rest.tally, rest.next) = (LeafSet::default(), Tally::default(), None);
+        tracker.confine(None);
+        true
+    }
+
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
+        if let Some(leaves) = self.rest.next.take() {
+            tracker.confine(leaves);
+        }
         let voxel_size = tracker.voxel_size();
         let step = MorphStep { speed: &self.speed, form: MorphSpeed::Upwind, dt: dt as f32, voxel_size };
         match self.bending {
@@ -318,7 +450,8 @@ mod tests {
             let mut level_set = ball(DVec3::new(0.3, -0.2, 0.1), 9.0);
             let mut control = |moment: &Moment| (moment.time < 30.0).then_some(0.5);
             let report =
-                move_surface(&mut level_set, &Spring { radius: 12.4 }, bending, 2000, &mut control, &run).unwrap();
+                move_surface(&mut level_set, &Spring { radius: 12.4 }, bending, 1e-3, 2000, &mut control, &run)
+                    .unwrap();
             assert_eq!(level_set.check(), []);
             // 12.4 − R = 2β/R. The volume is that of polygons, 0.6/R² of it less: 0.017 of the radius.
             let r = radius(&level_set);

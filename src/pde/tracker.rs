@@ -7,7 +7,7 @@ use super::domain::Domain;
 use super::step::{Blend, LeafKernel, Target};
 use super::{SolverOptions, TimeIntegrator};
 use crate::error::Result;
-use crate::grid::{Grid, LeafValues, PageLeaves, Paged, Transform};
+use crate::grid::{Grid, LeafSet, LeafValues, PageLeaves, Paged, Transform};
 use crate::levelset::LevelSet;
 use crate::region::{Region, RegionWeights};
 use crate::run::RunOptions;
@@ -64,6 +64,16 @@ impl<'a> Tracker<'a> {
             voxels
         };
         domain.leaves().par_pages().map(count).sum()
+    }
+
+    /// From now on these leaves alone move, with the new ones that they spill into; `None` for all of them. Not for a tracker with a region.
+    pub(super) fn confine(&mut self, leaves: Option<LeafSet>) {
+        self.domain = match leaves {
+            Some(leaves) => Domain::part(self.grid, leaves),
+            None => Domain::everywhere(self.grid),
+        };
+        // Outside of the domain, buffers hold what φ does: they begin anew.
+        self.buffers.clear();
     }
 
     /// Exchanges φ with second buffer `i`.

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{RangeMap, ptx, stanford, toml};
+use super::{RangeMap, e57, ptx, stanford, toml};
 use crate::error::{EditError, Result};
 use crate::run::RunOptions;
 
@@ -18,7 +18,7 @@ pub struct RangeSet {
 }
 
 impl RangeSet {
-    /// Reads a set from a `.toml`, `.conf` or `.ptx`. Without `skip_missing`, a scan that is not there is an error.
+    /// Reads a set from a `.toml`, `.conf`, `.ptx` or `.e57`. Without `skip_missing`, a scan that is not there is an error.
     ///
     /// A description in TOML, paths relative to it, poses from the scanner's frame to the world:
     ///
@@ -32,8 +32,9 @@ impl RangeSet {
     /// trajectory = "trajectory.log"   # 4x4 poses, one a map
     ///
     /// [[map]]
-    /// file = "depth/00000.png"        # or a PLY with a range grid, or a .ptx
+    /// file = "depth/00000.png"        # or an .exr, a PLY with a range grid, a .ptx or an .e57
     /// pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]   # instead of the trajectory
+    /// color = "color/00000.png"       # a picture of as many pixels
     /// confidence = "amplitude.png"    # a picture of amplitudes, with
     /// noise_table = [[100, 0.01], [1000, 0.002]]   # amplitude and standard deviation
     /// ```
@@ -46,8 +47,9 @@ impl RangeSet {
             "toml" => toml::read(path, run)?,
             "conf" => stanford::read_conf(path, run)?,
             "ptx" => ptx::read(path)?,
+            "e57" => e57::read(path, run)?,
             _ => {
-                let accepted = "of an unknown kind; sets of range maps are .toml, .conf or .ptx";
+                let accepted = "of an unknown kind; sets of range maps are .toml, .conf, .ptx or .e57";
                 return Err(EditError::input(path, accepted));
             }
         };

@@ -122,6 +122,8 @@ pub struct RangeMap {
     pub ranges: Vec<f32>,
     /// Confidence, 0 to 1.
     pub weights: Vec<f32>,
+    /// sRGB colours, or none at all.
+    pub colors: Vec<[u8; 3]>,
     /// Standard deviation of the ranges, world units; `None` if it is to be estimated.
     pub noise: Option<f64>,
     /// What rays without a measurement say.
@@ -164,6 +166,30 @@ pub enum Around {
 }
 
 impl RangeMap {
+    /// A map of rows of `width` pixels, each as good as the others.
+    pub fn new(name: String, projection: Projection, pose: DAffine3, width: usize, ranges: Vec<f32>) -> Self {
+        Self {
+            name,
+            projection,
+            pose,
+            width,
+            height: ranges.len() / width.max(1),
+            weights: vec![1.0; ranges.len()],
+            ranges,
+            colors: Vec::new(),
+            noise: None,
+            background: Background::default(),
+        }
+    }
+
+    /// The colour of the pixel that sees a point of the world.
+    pub fn color(&self, to_scanner: &DAffine3, xyz: DVec3) -> Option<[u8; 3]> {
+        let (pixel, _) = self.projection.project(to_scanner.transform_point3(xyz))?;
+        let within = pixel.cmpgt(DVec2::splat(-0.5)).all() && pixel.x < self.width as f64 - 0.5;
+        let (u, v) = ((pixel.x + 0.5) as usize, (pixel.y + 0.5) as usize);
+        self.colors.get(v * self.width + u).copied().filter(|_| within)
+    }
+
     /// What it says of the points up to `radius` from a point of the world, `clear` being how far from what was measured they have to be.
     pub fn look_around(&self, to_scanner: &DAffine3, xyz: DVec3, radius: f64, clear: f64) -> Around {
         let p = to_scanner.transform_point3(xyz);

@@ -5,9 +5,12 @@
 //! | `.toml` | a description of a set: files, poses, cameras, noise, units (see [`RangeSet::read`]) |
 //! | `.conf` | Stanford's list of scans with their poses; the scans are PLY files with a `range_grid` |
 //! | `.ptx` | scans of turning heads with their poses, as text |
+//! | `.e57` | scans of turning heads with their poses |
 //!
-//! Pictures of depth are 16-bit greyscale PNG. Missing files are named, and left out where that is asked for.
+//! Pictures of depth are 16-bit greyscale PNG or OpenEXR. Missing files are named, and left out where that is asked for.
 
+mod e57;
+mod exr;
 mod files;
 mod map;
 mod png;
@@ -16,6 +19,7 @@ mod stanford;
 #[cfg(test)]
 mod tests;
 mod toml;
+mod turning;
 
 pub use files::RangeSet;
 pub use map::{Around, Background, MOST_PIXELS, Projection, RangeMap, Seen, draw_parallel, is_rigid};

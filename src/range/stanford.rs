@@ -8,7 +8,7 @@ use std::path::Path;
 use glam::{DAffine3, DQuat, DVec3};
 
 use super::files::{beside, bytes, name, text};
-use super::{Background, RangeMap, RangeSet, draw_parallel, is_rigid};
+use super::{RangeMap, RangeSet, draw_parallel, is_rigid};
 use crate::error::{EditError, Result};
 use crate::run::RunOptions;
 
@@ -54,22 +54,13 @@ pub(super) fn read_scan(path: &Path, pose: DAffine3, run: &RunOptions) -> Result
     }
     let Some(bytes) = bytes(path)? else { return Ok(None) };
     let Grid { points, columns } = grid(&bytes).map_err(|problem| EditError::input(path, problem))?;
-    let empty = RangeMap {
-        name: name(path),
-        projection: super::Projection::Orthographic { first: glam::DVec2::ZERO, pitch: glam::DVec2::ONE },
-        pose,
-        width: 1,
-        height: 1,
-        ranges: vec![f32::NAN],
-        weights: vec![1.0],
-        noise: None,
-        background: Background::Unknown,
-    };
+    let parallel = super::Projection::Orthographic { first: glam::DVec2::ZERO, pitch: glam::DVec2::ONE };
+    let empty = RangeMap::new(name(path), parallel, pose, 1, vec![f32::NAN]);
     let Some(pitch) = pitch(&points, columns) else { return Ok(Some(empty)) };
     let drawn = draw_parallel(&points, columns, pitch, LONGEST * pitch)
         .ok_or_else(|| EditError::input(path, "its points are spread too far for their distances"))?;
-    let (projection, width, height, ranges) = drawn;
-    Ok(Some(RangeMap { projection, width, height, weights: vec![1.0; ranges.len()], ranges, ..empty }))
+    let (projection, width, _, ranges) = drawn;
+    Ok(Some(RangeMap::new(name(path), projection, pose, width, ranges)))
 }
 
 /// Median distance of neighbours, seen along z.

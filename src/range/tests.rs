@@ -204,6 +204,7 @@ fn low_pass_keeps_jumps_and_edges_are_not_trusted() {
         pose: DAffine3::IDENTITY,
         width,
         height,
+        colors: Vec::new(),
         weights: vec![1.0; ranges.len()],
         ranges,
         noise: None,
@@ -214,4 +215,132 @@ fn low_pass_keeps_jumps_and_edges_are_not_trusted() {
     map.distrust_edges(0.5);
     let weight = |u: usize| map.weights[10 * width + u];
     assert!(weight(19) < 0.4 && weight(18) == 1.0 && weight(20) < 0.4, "{} {}", weight(19), weight(18));
+}
+
+/// The points of a turning head at the origin, three rows of four columns on a ball of five; the second of the second column is missing.
+fn turned() -> Vec<(i64, i64, DVec3)> {
+    let mut points = Vec::new();
+    for column in 0..4i64 {
+        for row in 0..3i64 {
+            let (azimuth, elevation) = (0.1 * column as f64 - 3.1, 0.2 - 0.1 * row as f64);
+            let d = DVec3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
+            if (column, row) != (1, 1) {
+                points.push((column, row, d * 5.0));
+            }
+        }
+    }
+    points
+}
+
+/// An E57 file of these points at x = 7, with or without rows and columns, pose and colours.
+fn e57_file(places: bool, posed: bool) -> Vec<u8> {
+    use ::e57::{E57Writer, Quaternion, Record, RecordDataType, RecordName, RecordValue, Transform, Translation};
+    let mut file = std::io::Cursor::new(Vec::new());
+    let mut writer = E57Writer::new(&mut file, "file").unwrap();
+    let mut records = vec![Record::CARTESIAN_X_F64, Record::CARTESIAN_Y_F64, Record::CARTESIAN_Z_F64];
+    for name in [RecordName::ColorRed, RecordName::ColorGreen, RecordName::ColorBlue] {
+        records.push(Record { name, data_type: RecordDataType::U8 });
+    }
+    if places {
+        for name in [RecordName::RowIndex, RecordName::ColumnIndex] {
+            records.push(Record { name, data_type: RecordDataType::U16 });
+        }
+    }
+    let mut cloud = writer.add_pointcloud("cloud", records).unwrap();
+    let (rotation, translation) =
+        (Quaternion { w: 1.0, x: 0.0, y: 0.0, z: 0.0 }, Translation { x: 7.0, y: 0.0, z: 0.0 });
+    cloud.set_transform(posed.then_some(Transform { rotation, translation }));
+    for (column, row, p) in turned() {
+        let mut values = vec![RecordValue::Double(p.x), RecordValue::Double(p.y), RecordValue::Double(p.z)];
+        values.extend([255, 0, 60 * column].map(RecordValue::Integer));
+        if places {
+            values.extend([row, column].map(RecordValue::Integer));
+        }
+        cloud.add_point(values).unwrap();
+    }
+    cloud.finalize().unwrap();
+    writer.finalize().unwrap();
+    drop(writer);
+    file.into_inner()
+}
+
+#[test]
+fn e57_scans() {
+    for (places, posed) in [(true, true), (true, false), (false, true)] {
+        let folder = folder_with(&[("a.e57", e57_file(places, posed))]);
+        let set = read(&folder, "a.e57", false).unwrap();
+        let map = &set.maps[0];
+        // Loose points may share a pixel.
+        assert!(map.count() == 11 || !places && map.count() >= 5, "{places} {posed}");
+        let place = if posed { DVec3::X * 7.0 } else { DVec3::ZERO };
+        let to_scanner = map.pose.inverse();
+        for (column, _, p) in turned() {
+            let (seen, color) = (map.look(&to_scanner, p * 0.8 + place), map.color(&to_scanner, p + place));
+            assert!(matches!(seen, Seen::Surface { distance, .. } if (distance - 1.0).abs() < 1e-5), "{seen:?}");
+            assert!(color == Some([255, 0, 60 * column as u8]) || !places && color.is_some_and(|c| c[0] == 255));
+        }
+        assert!(!places || (map.width, map.height) == (4, 3));
+    }
+    let whole = e57_file(true, true);
+    let mut flipped = whole.clone();
+    flipped[100] ^= 1;
+    for (bytes, word) in [
+        (whole[..whole.len() / 2].to_vec(), "no E57 file"),
+        (flipped, "no E57 file"),
+        (b"nothing".to_vec(), "no E57 file"),
+        (e57_file(false, false), "no range map"),
+    ] {
+        let said = read(&folder_with(&[("a.e57", bytes)]), "a.e57", false).unwrap_err();
+        assert!(said.contains(word), "{said}");
+    }
+}
+
+#[test]
+fn depths_of_exr_and_colours() {
+    use ::exr::prelude::{
+        AnyChannel, AnyChannels, Encoding, FlatSamples, Image, Layer, LayerAttributes, WritableImage,
+    };
+    let depths: Vec<f32> = (0..12).map(|n| [2.0, f32::NAN, f32::INFINITY, -1.0][if n < 4 { n } else { 0 }]).collect();
+    let file = |names: &[&str]| {
+        let channels = names.iter().map(|name| AnyChannel::new(*name, FlatSamples::F32(depths.clone())));
+        let channels = AnyChannels::sort(channels.collect());
+        let layer = Layer::new((4, 3), LayerAttributes::named("all"), Encoding::UNCOMPRESSED, channels);
+        let mut bytes = std::io::Cursor::new(Vec::new());
+        Image::from_layer(layer).write().to_buffered(&mut bytes).unwrap();
+        bytes.into_inner()
+    };
+    let mut colors = Vec::new();
+    let mut encoder = ::png::Encoder::new(&mut colors, 4, 3);
+    encoder.set_color(::png::ColorType::Rgb);
+    let data: Vec<u8> = (0..36).collect();
+    encoder.write_header().unwrap().write_image_data(&data).unwrap();
+    let description =
+        "version = 1\ncamera = { focal = [2, 2], centre = [1.5, 1] }\n[[map]]\nfile = \"a.exr\"\ncolor = \"c.png\"\n";
+    let folder = folder_with(&[
+        ("set.toml", description.into()),
+        ("a.exr", file(&["A", "Z"])),
+        ("b.exr", file(&["A", "B"])),
+        ("c.png", colors),
+        ("d.png", picture(2, 2, &[0; 4])),
+    ]);
+    let set = read(&folder, "set.toml", false).unwrap();
+    let map = &set.maps[0];
+    // What is no positive number is no measurement.
+    assert_eq!((map.width, map.height, map.count()), (4, 3, 9));
+    let p = map.points(1).last().unwrap();
+    assert!((p - DVec3::new(1.5, 1.0, 2.0)).length() < 1e-6, "{p}");
+    assert_eq!(map.color(&map.pose.inverse(), p), Some([33, 34, 35]));
+    for (from, to, word) in
+        [("a.exr", "b.exr", "one named Z"), ("c.png", "d.png", "2 x 2"), ("c.png", "e.png", "no such file")]
+    {
+        std::fs::write(folder.path().join("set.toml"), description.replacen(from, to, 1)).unwrap();
+        let said = read(&folder, "set.toml", false).unwrap_err();
+        assert!(said.contains(word), "{said}");
+    }
+    let whole = std::fs::read(folder.path().join("a.exr")).unwrap();
+    std::fs::write(folder.path().join("set.toml"), description).unwrap();
+    for bytes in [&whole[..whole.len() / 2], &b"nothing"[..]] {
+        std::fs::write(folder.path().join("a.exr"), bytes).unwrap();
+        assert!(read(&folder, "set.toml", false).is_err());
+    }
 }

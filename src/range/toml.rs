@@ -6,7 +6,7 @@ use glam::{DAffine3, DMat4, DVec2};
 use serde::Deserialize;
 
 use super::files::{beside, bytes, name, text};
-use super::{Background, Projection, RangeMap, RangeSet, is_rigid, png, ptx, stanford};
+use super::{Background, Projection, RangeMap, RangeSet, e57, exr, is_rigid, png, ptx, stanford};
 use crate::error::{EditError, Result};
 use crate::run::RunOptions;
 
@@ -64,6 +64,7 @@ struct Entry {
     #[serde(flatten)]
     own: Common,
     confidence: Option<String>,
+    color: Option<String>,
     #[serde(default)]
     noise_table: Vec<[f64; 2]>,
 }
@@ -71,7 +72,7 @@ struct Entry {
 /// What a description may hold; flattened structs let others through.
 const KEYS: [&[&str]; 2] = [
     &["version", "units", "noise", "background", "scale", "camera", "orthographic", "trajectory", "map"],
-    &["file", "pose", "noise", "background", "scale", "camera", "orthographic", "confidence", "noise_table"],
+    &["file", "pose", "noise", "background", "scale", "camera", "orthographic", "confidence", "noise_table", "color"],
 ];
 
 pub(super) fn read(path: &Path, run: &RunOptions) -> Result<RangeSet> {
@@ -121,15 +122,20 @@ pub(super) fn read(path: &Path, run: &RunOptions) -> Result<RangeSet> {
             set.missing.push(file);
             continue;
         }
-        match file.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default().as_str() {
-            "png" => set.maps.push(picture(path, &file, entry, &description.common, &place)?),
+        let ending = file.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+        match ending.as_str() {
+            "png" | "exr" => set.maps.push(picture(path, &file, entry, &description.common, &place)?),
             "ply" => set.maps.extend(stanford::read_scan(&file, pose, run)?),
-            "ptx" => {
-                let scans = ptx::read(&file)?;
+            "ptx" | "e57" => {
+                let scans = if ending == "e57" { e57::read(&file, run)? } else { ptx::read(&file)? };
                 set.maps.extend(scans.maps);
                 set.warnings.extend(scans.warnings);
             }
-            _ => return Err(place("a .png of depths, a .ply with a range grid or a .ptx is wanted".into())),
+            _ => {
+                return Err(place(
+                    "a .png or .exr of depths, a .ply with a range grid, a .ptx or an .e57 is wanted".into(),
+                ));
+            }
         }
         let common = |of: fn(&Common) -> Option<&String>| of(&entry.own).or_else(|| of(&description.common));
         let background = match common(|c| c.background.as_ref()).map(String::as_str) {
@@ -145,12 +151,15 @@ pub(super) fn read(path: &Path, run: &RunOptions) -> Result<RangeSet> {
             scale(map, description.units);
             map.background = background;
             map.noise = noise.or(map.noise);
-            map.pose = match file.extension().is_some_and(|e| e.eq_ignore_ascii_case("ptx")) {
+            map.pose = match ["ptx", "e57"].contains(&ending.as_str()) {
                 // These have poses of their own.
                 true if entry.pose.is_none() && poses.is_none() => map.pose,
                 _ => pose,
             };
             map.pose.translation *= description.units;
+            if let Some(colors) = &entry.color {
+                map.colors = painted(map, &beside(path, colors))?;
+            }
             if let Some(amplitudes) = &entry.confidence {
                 confide(map, &beside(path, amplitudes), &entry.noise_table, noise, &place)?;
             }
@@ -167,7 +176,14 @@ fn picture(
     common: &Common,
     place: &dyn Fn(String) -> EditError,
 ) -> Result<RangeMap> {
-    let (width, height, counts) = png::read(file, &bytes(file)?.unwrap_or_default())?;
+    let read = bytes(file)?.unwrap_or_default();
+    let (width, _, counts) = match file.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
+        true => exr::read(file, &read)?,
+        false => {
+            let (width, height, counts) = png::read(file, &read)?;
+            (width, height, counts.into_iter().map(f32::from).collect())
+        }
+    };
     let scale = entry.own.scale.or(common.scale).unwrap_or(1.0);
     if !(scale > 0.0 && scale.is_finite()) {
         return Err(place(format!("scale = {scale}: a positive number of units a count is wanted")));
@@ -195,7 +211,7 @@ fn picture(
         (None, None) => return Err(place("a `camera` or `orthographic` is wanted".into())),
     };
     let ranges = counts.iter().enumerate().map(|(at, count)| {
-        if *count == 0 {
+        if !(*count > 0.0 && count.is_finite()) {
             return f32::NAN;
         }
         let depth = f64::from(*count) * scale;
@@ -207,17 +223,20 @@ fn picture(
             _ => depth as f32,
         }
     });
-    Ok(RangeMap {
-        name: name(file),
-        projection,
-        pose: DAffine3::IDENTITY,
-        width,
-        height,
-        ranges: ranges.collect(),
-        weights: vec![1.0; width * height],
-        noise: None,
-        background: Background::Unknown,
-    })
+    Ok(RangeMap::new(name(file), projection, DAffine3::IDENTITY, width, ranges.collect()))
+}
+
+/// The colours of a picture of as many pixels as the map has.
+fn painted(map: &RangeMap, file: &Path) -> Result<Vec<[u8; 3]>> {
+    let Some(bytes) = bytes(file)? else { return Err(EditError::input(file, "there is no such file")) };
+    let (width, height, colors) = png::read_colors(file, &bytes)?;
+    match (width, height) == (map.width, map.height) {
+        true => Ok(colors),
+        false => Err(EditError::input(
+            file,
+            format!("{width} x {height} pixels, the depths have {} x {}", map.width, map.height),
+        )),
+    }
 }
 
 /// From the units of the files to world units.

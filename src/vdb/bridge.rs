@@ -112,6 +112,12 @@ pub(super) mod ffi {
         fn carry_metadata(self: Pin<&mut Output>, archive: &Archive) -> Result<()>;
         fn carry_grid(self: Pin<&mut Output>, archive: &Archive, index: usize) -> Result<()>;
         fn add_grid(self: Pin<&mut Output>, grid: UniquePtr<FloatGrid>) -> Result<()>;
+        fn add_vectors(
+            self: Pin<&mut Output>,
+            x: UniquePtr<FloatGrid>,
+            y: UniquePtr<FloatGrid>,
+            z: UniquePtr<FloatGrid>,
+        ) -> Result<()>;
         fn write_path(self: Pin<&mut Output>, path: &[u8], compression: u32) -> Result<()>;
         fn write_bytes(self: Pin<&mut Output>, compression: u32) -> Result<UniquePtr<CxxString>>;
         fn seal(self: Pin<&mut Output>) -> Result<()>;

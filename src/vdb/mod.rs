@@ -24,4 +24,6 @@ mod write;
 pub use band::{Band, BandFacts, Range, diagnose_band};
 pub use listing::{Compression, FileListing, GridListing, MetaItem, Precision};
 pub use read::{ReadLevelSet, VdbFile, library_version, list, open, set_threads};
-pub use write::{FieldToWrite, GridToWrite, WriteOptions, WriteReport, write, write_with_fields};
+pub use write::{
+    FieldToWrite, GridToWrite, VectorsToWrite, WriteOptions, WriteReport, write, write_with_fields, write_with_vectors,
+};

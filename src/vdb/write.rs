@@ -51,6 +51,15 @@ pub struct FieldToWrite<'a> {
     pub name: &'a str,
 }
 
+/// Three fields of one level set on their way to a file, as a grid of vectors.
+#[derive(Clone, Copy)]
+pub struct VectorsToWrite<'a> {
+    /// The components.
+    pub components: &'a [Field; 3],
+    /// Their name.
+    pub name: &'a str,
+}
+
 /// What was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WriteReport {
@@ -72,7 +81,18 @@ pub fn write(
     input: Option<&VdbFile>,
     options: &WriteOptions,
 ) -> Result<WriteReport> {
-    write_with_fields(path, grids, &[], input, options)
+    write_all(path.as_ref(), grids, &[], None, input, options)
+}
+
+/// As [`write()`], with a grid of vectors after all other grids.
+pub fn write_with_vectors(
+    path: impl AsRef<Path>,
+    grids: &[GridToWrite<'_>],
+    vectors: VectorsToWrite<'_>,
+    input: Option<&VdbFile>,
+    options: &WriteOptions,
+) -> Result<WriteReport> {
+    write_all(path.as_ref(), grids, &[], Some(vectors), input, options)
 }
 
 /// As [`write()`], with fields after all other grids.
@@ -83,7 +103,17 @@ pub fn write_with_fields(
     input: Option<&VdbFile>,
     options: &WriteOptions,
 ) -> Result<WriteReport> {
-    let path = path.as_ref();
+    write_all(path.as_ref(), grids, fields, None, input, options)
+}
+
+fn write_all(
+    path: &Path,
+    grids: &[GridToWrite<'_>],
+    fields: &[FieldToWrite<'_>],
+    vectors: Option<VectorsToWrite<'_>>,
+    input: Option<&VdbFile>,
+    options: &WriteOptions,
+) -> Result<WriteReport> {
     let output = Target { path };
     let compression = options.compression.or_else(|| Compression::of_all(&input?.listing().grids));
     let compression = compression.unwrap_or(Compression::Blosc);
@@ -103,6 +133,14 @@ pub fn write_with_fields(
     for field in fields {
         let made = to_openvdb_field(field, options).and_then(|grid| content.pin_mut().add_grid(grid));
         made.map_err(|e| output.error(e.what()))?;
+        count += 1;
+    }
+    if let Some(VectorsToWrite { components: [x, y, z], name }) = vectors {
+        // Halves are compared after rounding for grids of floats alone.
+        let whole = WriteOptions { precision: None, ..options.clone() };
+        let component = |field| to_openvdb_field(&FieldToWrite { field, name }, &whole);
+        let mut add = || content.pin_mut().add_vectors(component(x)?, component(y)?, component(z)?);
+        add().map_err(|e| output.error(e.what()))?;
         count += 1;
     }
     let bytes = output.write(content.pin_mut(), compression.flags())?;

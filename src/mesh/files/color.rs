@@ -21,6 +21,11 @@ pub(super) fn to_srgb(linear: f32) -> f32 {
     encoded as f32
 }
 
+/// The linear values of an 8-bit sRGB colour.
+pub(crate) fn linear_from_srgb8(color: [u8; 3]) -> [f32; 3] {
+    color.map(|c| to_linear(f32::from(c) / 255.0))
+}
+
 /// A file's sRGB colour with linear alpha, each 0..1, as a mesh holds it.
 pub(super) fn decode([r, g, b, a]: [f32; 4]) -> [f32; 4] {
     [to_linear(r), to_linear(g), to_linear(b), unit(a)]

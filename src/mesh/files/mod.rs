@@ -19,6 +19,7 @@ mod polygon;
 mod stl;
 mod text;
 
+pub(crate) use color::linear_from_srgb8;
 use std::ffi::OsStr;
 use std::fmt;
 use std::io::{self, Write};

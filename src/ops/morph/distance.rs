@@ -3,14 +3,16 @@
 //! In the band it is the target's own φ; beyond, exact distances on a lattice of a few voxels, interpolated. A surface far away moves by the
 //! latter; where it comes to rest, the former counts.
 
-use glam::{DVec3, IVec3};
+use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 
 use super::NAME;
 use crate::error::Result;
-use crate::levelset::{LevelSet, Sampler};
+use crate::grid::{LEAF_DIM, LeafMask};
+use crate::levelset::LevelSet;
 use crate::mesh::{Bvh, level_set_to_mesh};
 use crate::run::RunOptions;
+use crate::stencil::Cube;
 
 /// Most nodes of the lattice.
 const MOST_NODES: f64 = 150_000.0;
@@ -19,7 +21,7 @@ const MOST_NODES: f64 = 150_000.0;
 const MARGIN: i32 = 4;
 
 /// The part of the band in which the target's own values are taken: at its rim interpolation meets ±background.
-const OWN: f64 = 0.65;
+const OWN: f32 = 0.65;
 
 /// The signed distance to a level set (world units), at positions in its index space.
 pub(super) struct TargetDistance {
@@ -37,7 +39,7 @@ impl TargetDistance {
         let extent = (hi - lo + 2 * MARGIN).as_dvec3();
         let mut spacing = 1;
         while (extent / f64::from(spacing) + 2.0).element_product() > MOST_NODES {
-            spacing *= 2;
+            spacing += 1;
         }
         let first = lo - MARGIN;
         let size = (hi + MARGIN - first) / spacing + 2;
@@ -73,40 +75,27 @@ impl TargetDistance {
         &self.near
     }
 
-    /// The distance at a position; `sampler` is one of the level set.
-    pub fn at(&self, sampler: &mut Sampler, ijk: DVec3) -> f64 {
-        let own = OWN * f64::from(self.near.background());
-        let far = self.far_at(ijk);
-        // So far away that neither the sign nor the band can be otherwise.
-        if far.abs() > own + 2.0 * f64::from(self.spacing) * self.near.voxel_size() {
-            return far;
+    /// The distances at the surface points that the voxels of a leaf see.
+    pub fn around(&self, leaf: IVec3) -> Around<'_> {
+        let own = OWN * self.near.background();
+        let voxel_size = self.near.voxel_size() as f32;
+        let mut around = Around { target: self, origin: leaf.as_dvec3(), cube: None, own, sure: own };
+        around.sure += 2.0 * self.spacing as f32 * voxel_size;
+        // From the middle of the leaf to the corners of its rim.
+        let rim = (1.25 * self.near.half_width()).ceil() as usize;
+        let radius = (3.5 + rim as f32) * 3f32.sqrt() * voxel_size;
+        if around.far(leaf.as_dvec3() + 3.5).abs() > around.sure + radius {
+            return around;
         }
-        let near = f64::from(sampler.trilinear(ijk));
-        if near.abs() < own {
-            return near;
-        }
-        // The sign is the level set's: the lattice does not see what is thinner than its spacing.
-        near.signum() * far.abs().max(own)
-    }
-
-    fn far_at(&self, ijk: DVec3) -> f64 {
-        let last = (self.size - 1).as_dvec3() - 1e-6;
-        let at = ((ijk - self.first.as_dvec3()) / f64::from(self.spacing)).clamp(DVec3::ZERO, last);
-        let (cell, t) = (at.floor().as_ivec3(), at - at.floor());
-        let node = |step: IVec3| {
-            let IVec3 { x, y, z } = cell + step;
-            f64::from(self.far[((x * self.size.y + y) * self.size.z + z) as usize])
-        };
-        let along = |x: i32, y: i32| {
-            let (a, b) = (node(IVec3::new(x, y, 0)), node(IVec3::new(x, y, 1)));
-            a + (b - a) * t.z
-        };
-        let across = |x: i32| {
-            let (a, b) = (along(x, 0), along(x, 1));
-            a + (b - a) * t.y
-        };
-        let (a, b) = (across(0), across(1));
-        a + (b - a) * t.x
+        let grid = self.near.grid();
+        let neighbours = std::array::from_fn(|n| {
+            let n = n as i32;
+            grid.find(leaf + IVec3::new(n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1) * LEAF_DIM)
+        });
+        let mut cube = Cube::new(rim);
+        cube.gather(grid.value_pages(), &neighbours, LeafMask::FULL);
+        around.cube = Some(cube);
+        around
     }
 
     /// M = −∫ b over the inside of a solid on the same lattice: what it shares with the target less what it has outside of it, both the more
@@ -128,4 +117,74 @@ impl TargetDistance {
         let rows: Vec<f64> = (0..self.size.x * self.size.y).into_par_iter().map(of_row).collect();
         rows.into_iter().sum::<f64>() * (step * solid.voxel_size()).powi(3)
     }
+}
+
+/// The distance near a leaf.
+pub(super) struct Around<'a> {
+    target: &'a TargetDistance,
+    origin: DVec3,
+    /// The target's own values, where they matter.
+    cube: Option<Cube>,
+    /// The distance up to which they count.
+    own: f32,
+    /// The distance from which on neither the sign nor the band can be otherwise.
+    sure: f32,
+}
+
+impl Around<'_> {
+    /// The signed distance (world units) at a position of the target's index space.
+    #[inline]
+    pub fn at(&self, ijk: DVec3) -> f64 {
+        let Some(cube) = &self.cube else { return self.far(ijk).into() };
+        let near = self.near(cube, ijk);
+        if near.abs() < self.own {
+            return near.into();
+        }
+        let far = self.far(ijk);
+        if far.abs() > self.sure {
+            return far.into();
+        }
+        // The sign is the level set's: the lattice does not see what is thinner than its spacing.
+        f64::from(near.signum() * far.abs().max(self.own))
+    }
+
+    /// By the target's own values; positions beyond the rim as at the rim.
+    #[inline]
+    fn near(&self, cube: &Cube, ijk: DVec3) -> f32 {
+        let side = LEAF_DIM as usize + 2 * cube.width();
+        let at = (ijk - self.origin).as_vec3() + cube.width() as f32;
+        let (cell, t) = split(at, Vec3::splat(side as f32 - 1.0));
+        trilinear(cube.slab(cell[0]), cube.slab(cell[0] + 1), cell[1] * side + cell[2], side, t)
+    }
+
+    /// By the lattice.
+    #[inline]
+    fn far(&self, ijk: DVec3) -> f32 {
+        let TargetDistance { first, spacing, size, far, .. } = self.target;
+        let at = (ijk - first.as_dvec3()).as_vec3() / *spacing as f32;
+        let (cell, t) = split(at, (*size - 1).as_vec3());
+        let (row, slab) = (size.z as usize, (size.y * size.z) as usize);
+        let first = cell[0] * slab;
+        trilinear(&far[first..], &far[first + slab..], cell[1] * row + cell[2], row, t)
+    }
+}
+
+/// The cell of a lattice whose last node is `last`, and the place in it.
+#[inline]
+fn split(at: Vec3, last: Vec3) -> ([usize; 3], Vec3) {
+    // Not quite the last node: its cell would be one beyond.
+    let at = at.clamp(Vec3::ZERO, last * (1.0 - f32::EPSILON) - 1e-4);
+    let cell = at.as_uvec3();
+    (cell.to_array().map(|c| c as usize), at - cell.as_vec3())
+}
+
+/// Between two slabs of constant x, from the place of the cell's first corner on.
+#[inline]
+fn trilinear(below: &[f32], above: &[f32], first: usize, row: usize, t: Vec3) -> f32 {
+    let lerp = |a: f32, b: f32, t: f32| a + (b - a) * t;
+    let of_slab = |slab: &[f32]| {
+        let (a, b) = (&slab[first..first + 2], &slab[first + row..first + row + 2]);
+        lerp(lerp(a[0], a[1], t.z), lerp(b[0], b[1], t.z), t.y)
+    };
+    lerp(of_slab(below), of_slab(above), t.x)
 }

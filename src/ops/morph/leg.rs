@@ -24,6 +24,9 @@ const TOLERANCE: f64 = 0.01;
 /// Steps that look for the place of a frame at most: where the flow slows down they would become ever shorter.
 const MOST_LANDING_STEPS: u32 = 8;
 
+/// The speed that is rest, as a part of the RMS distance at which a flow ends, a unit of time.
+const AT_REST: f64 = 0.25;
+
 /// F = −f(b).
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Law {
@@ -62,10 +65,10 @@ struct Towards<'a> {
 
 impl SurfaceSpeed for Towards<'_> {
     fn of_leaf(&self, leaf: &LeafSurface<'_>, speed: &mut LeafValues) -> Tally {
-        let mut sampler = self.target.level_set().sampler();
+        let target = self.target.around(leaf.origin);
         let mut tally = Tally::default();
         for foot in leaf.feet() {
-            let b = self.target.at(&mut sampler, foot.point);
+            let b = target.at(foot.point);
             let f = self.law.of(b);
             speed.0[foot.offset] = -f as f32;
             if foot.beside {
@@ -122,7 +125,7 @@ impl Leg<'_> {
             rms = moment.tally.rms();
             None
         };
-        move_surface(&mut start.clone(), &self.towards(), 0.0, 1, &mut control, run)?;
+        move_surface(&mut start.clone(), &self.towards(), 0.0, 0.0, 1, &mut control, run)?;
         Ok(rms)
     }
 
@@ -217,7 +220,7 @@ impl Leg<'_> {
             }
             (landing > 0 || progress.goes_on(rms)).then_some(longest)
         };
-        move_surface(&mut surface, &self.towards(), self.bending, MOST_STEPS, &mut control, run)?;
+        move_surface(&mut surface, &self.towards(), self.bending, AT_REST * self.stop, MOST_STEPS, &mut control, run)?;
         if let Some(error) = failure {
             return Err(error);
         }

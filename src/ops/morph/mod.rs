@@ -35,7 +35,7 @@ use crate::run::RunOptions;
 use distance::TargetDistance;
 use leg::{Law, Leg};
 use pose::{Moments, Pose};
-pub use sequence::{FrameFacts, Place, Sequence, SequenceReport, TakeFrame};
+pub use sequence::{FrameFacts, Place, Sequence, SequenceReport, TakeFrame, Ways};
 
 const NAME: &str = "morph";
 

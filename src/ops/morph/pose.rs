@@ -6,6 +6,8 @@
 //! with a pivot p, a shift d, a scale s, a rotation q (by slerp) and the thin-plate displacement u of landmarks. T(·, 1) takes the source's frame to
 //! the target's. The similarity is given, that of the moments, or the best for the landmarks, of which u is the rest.
 
+use std::sync::Arc;
+
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use nalgebra::Matrix3;
 use rayon::prelude::*;
@@ -28,12 +30,13 @@ const MOST_NEWTON_STEPS: usize = 50;
 const NEWTON_TOLERANCE: f64 = 1e-6;
 
 /// T.
+#[derive(Clone)]
 pub(super) struct Pose {
     pivot: DVec3,
     shift: DVec3,
     scale: f64,
     rotation: DQuat,
-    warp: Option<Displacement>,
+    warp: Option<Arc<Displacement>>,
 }
 
 impl Pose {
@@ -105,12 +108,12 @@ impl Pose {
         let rotation = rotation_of(&cross);
         let scale = (size_b / size_a).sqrt();
         let mut pose = Self { pivot: a, shift: b - a, scale, rotation, warp: None };
-        let rest: Vec<(DVec3, DVec3)> = pairs.iter().map(|(p, q)| (*p, pose.unplaced(*q) - *p)).collect();
+        let rest: Vec<(DVec3, DVec3)> = pairs.iter().map(|(p, q)| (*p, pose.unplaced(*q, 1.0) - *p)).collect();
         let refused = |_| {
             let accepted = "pairs of points whose first points are at different places";
             EditError::parameter(NAME, "landmarks", pairs.len(), accepted)
         };
-        pose.warp = Some(Displacement::new(&rest).map_err(refused)?);
+        pose.warp = Some(Arc::new(Displacement::new(&rest).map_err(refused)?));
         Ok(pose)
     }
 
@@ -124,22 +127,24 @@ impl Pose {
         self.pivot + self.shift * alpha + turned * self.scale.powf(alpha)
     }
 
-    /// What the similarity at α = 1 takes to y.
-    fn unplaced(&self, y: DVec3) -> DVec3 {
-        self.pivot + self.rotation.inverse() * (y - self.pivot - self.shift) / self.scale
+    /// What the similarity at α takes to y.
+    fn unplaced(&self, y: DVec3, alpha: f64) -> DVec3 {
+        let turned = DQuat::IDENTITY.slerp(self.rotation, alpha).inverse() * (y - self.pivot - self.shift * alpha);
+        self.pivot + turned / self.scale.powf(alpha)
     }
 
-    /// The x with T(x, 1) = y; `None` where the iteration does not end.
-    fn inverse(&self, y: DVec3, voxel_size: f64) -> Option<DVec3> {
-        let target = self.unplaced(y);
+    /// The x with T(x, α) = y; `None` where the iteration does not end.
+    pub fn inverse(&self, y: DVec3, alpha: f64, voxel_size: f64) -> Option<DVec3> {
+        let target = self.unplaced(y, alpha);
         let Some(warp) = &self.warp else { return Some(target) };
         let mut x = target;
         for _ in 0..MOST_NEWTON_STEPS {
-            let error = x + warp.at(x) - target;
+            let error = x + warp.at(x) * alpha - target;
             if error.length() < NEWTON_TOLERANCE * voxel_size {
                 return Some(x);
             }
-            x -= gradient(warp, x, voxel_size).inverse() * error;
+            let slope = gradient(warp, x, voxel_size) - DMat3::IDENTITY;
+            x -= (DMat3::IDENTITY + slope * alpha).inverse() * error;
             if !x.is_finite() {
                 return None;
             }
@@ -154,7 +159,7 @@ impl Pose {
         let found: Vec<Option<DVec3>> = mesh
             .positions
             .par_iter()
-            .map(|y| self.inverse(*y, voxel_size).filter(|x| !self.folds(*x, voxel_size)))
+            .map(|y| self.inverse(*y, 1.0, voxel_size).filter(|x| !self.folds(*x, voxel_size)))
             .collect();
         run.check(NAME)?;
         for (position, found) in mesh.positions.iter_mut().zip(found) {

@@ -1,5 +1,7 @@
 //! A sequence of frames through two shapes or more: planned, placed, run.
 
+use glam::DVec3;
+use rayon::prelude::*;
 use serde_json::json;
 
 use super::distance::TargetDistance;
@@ -44,6 +46,26 @@ impl FrameFacts {
             "leg": self.place.0 + 1, "place": self.place.1, "rms_voxels": self.rms_voxels,
             "shared_volume": self.shared_volume, "volume": self.volume, "time": self.time,
         })
+    }
+}
+
+/// Where points of a frame come from and where they go.
+pub struct Ways {
+    poses: Vec<Option<Pose>>,
+    voxel_size: f64,
+}
+
+impl Ways {
+    /// The places on the shapes around a frame of points of that frame, undoing the transformation as far as it has gone and doing it to its end: the colours of
+    /// either shape are looked for there.
+    pub fn of(&self, place: Place, points: &[DVec3]) -> [Vec<DVec3>; 2] {
+        let Some(pose) = self.poses.get(place.0).and_then(Option::as_ref) else {
+            return [points.to_vec(), points.to_vec()];
+        };
+        let back = |y: &DVec3| pose.inverse(*y, place.1, self.voxel_size).unwrap_or(*y);
+        let source: Vec<DVec3> = points.par_iter().map(back).collect();
+        let target = source.par_iter().map(|x| pose.at(*x, 1.0)).collect();
+        [source, target]
     }
 }
 
@@ -141,6 +163,12 @@ impl<'a> Sequence<'a> {
     /// The shapes, on the lattice of the first one.
     pub fn shapes(&self) -> &[LevelSet] {
         &self.shapes
+    }
+
+    /// Where points of its frames come from and where they go.
+    pub fn ways(&self) -> Ways {
+        let voxel_size = self.shapes.first().map_or(1.0, LevelSet::voxel_size);
+        Ways { poses: self.legs.iter().map(|leg| leg.pose.clone()).collect(), voxel_size }
     }
 
     /// How long each leg is, in the quantity that frames are spaced by.

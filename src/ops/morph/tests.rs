@@ -68,7 +68,7 @@ fn at_rest(from: &LevelSet, to: &LevelSet, steps: u32) -> LevelSet {
     let mut surface = from.clone();
     let leg = Morph::default().leg(&distance);
     let mut control = |moment: &Moment| (moment.steps < steps).then_some(0.5);
-    move_surface(&mut surface, &leg.towards(), 0.0, steps, &mut control, &run).unwrap();
+    move_surface(&mut surface, &leg.towards(), 0.0, 0.005, steps, &mut control, &run).unwrap();
     surface
 }
 

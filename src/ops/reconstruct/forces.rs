@@ -1,18 +1,19 @@
 //! What range maps say to a surface, and the first surface that follows from them.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use glam::{DAffine3, DVec3, IVec3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
 use super::NAME;
-use crate::error::Result;
+use crate::error::{EditError, Result};
 use crate::grid::{Grid, LEAF_DIM, LeafMask, LeafValues, Transform, offset_to_local};
-use crate::levelset::{LevelSet, background};
+use crate::levelset::{LevelSet, UnionFind, background};
 use crate::mesh::{TriangleMesh, level_set_of_mesh, level_set_to_mesh};
 use crate::pde::{LeafSurface, SurfaceSpeed, Tally};
-use crate::range::{Around, Background, RangeMap, Seen};
+use crate::range::{Around, Background, Projection, RangeMap, Seen};
 use crate::run::RunOptions;
 
 /// The window is cut off at so many times its width.
@@ -31,22 +32,28 @@ const DENSITIES: [f64; 2] = [0.1, 10.0];
 pub(super) struct Term<'a> {
     pub map: &'a RangeMap,
     to_scanner: DAffine3,
+    rays: Rays,
     /// s of the window exp(−D²/2s²), world units.
     pub width: f64,
     /// σ_ref²/σ².
     confidence: f64,
     /// 1 over the mean density of pixels.
     per_density: f64,
+    /// How far behind a measurement it is solid, as far as this map knows.
+    thickness: f64,
 }
 
 impl<'a> Term<'a> {
-    pub fn new(map: &'a RangeMap, width: f64, confidence: f64, mean_density: Option<f64>) -> Self {
+    pub fn new(map: &'a RangeMap, width: f64, confidence: f64, mean_density: Option<f64>, thickness: f64) -> Self {
         Self {
             map,
             to_scanner: map.pose.inverse(),
+            rays: Rays::of(map),
             width,
             confidence,
             per_density: mean_density.map_or(1.0, f64::recip),
+            // Within the window it is what was measured.
+            thickness: thickness.max(CUT * width),
         }
     }
 
@@ -59,13 +66,71 @@ impl<'a> Term<'a> {
                 if distance > CUT * self.width {
                     return Look::InFront(weight);
                 }
+                if distance < -self.thickness {
+                    return Look::Beyond;
+                }
                 if distance < -CUT * self.width {
                     return Look::Behind;
                 }
-                let window = (-0.5 * (distance / self.width).powi(2)).exp();
-                let density = (density * self.per_density).clamp(DENSITIES[0], DENSITIES[1]);
-                Look::Near { distance, weight: self.confidence * density * window * weight, direction }
+                Look::Near { distance, weight: self.window(distance) * self.weight(density, weight), direction }
             }
+        }
+    }
+
+    /// D and c·μ where it measured something at most `reach` from the point.
+    fn sample(&self, xyz: DVec3, reach: f64) -> Option<(f64, f64)> {
+        match self.map.look(&self.to_scanner, xyz) {
+            Seen::Surface { distance, weight, density, .. } if distance.abs() < reach => {
+                Some((distance, self.weight(density, weight)))
+            }
+            _ => None,
+        }
+    }
+
+    /// w, a Gaussian; 0 where it is cut off.
+    fn window(&self, distance: f64) -> f64 {
+        let widths = distance / self.width;
+        if widths.abs() < CUT { (-0.5 * widths * widths).exp() } else { 0.0 }
+    }
+
+    /// The colour that the map saw at a point of the surface with that normal, and how much it counts.
+    pub fn color(&self, xyz: DVec3, normal: DVec3) -> Option<([u8; 3], f64)> {
+        let Look::Near { weight, direction, .. } = self.at(xyz) else { return None };
+        let weight = weight * -normal.dot(direction);
+        Some((self.map.color(&self.to_scanner, xyz)?, weight)).filter(|(_, weight)| *weight > 0.0)
+    }
+
+    /// Whether the map sees a point of the surface with that normal.
+    pub fn sees(&self, xyz: DVec3, normal: DVec3) -> bool {
+        matches!(self.at(xyz), Look::Near { weight, direction, .. } if weight > 0.0 && -normal.dot(direction) > 0.0)
+    }
+
+    /// c·μ.
+    fn weight(&self, density: f64, weight: f64) -> f64 {
+        self.confidence * (density * self.per_density).clamp(DENSITIES[0], DENSITIES[1]) * weight
+    }
+}
+
+/// The directions of a map's rays in the world.
+enum Rays {
+    Parallel(DVec3),
+    /// From a point.
+    From(DVec3),
+}
+
+impl Rays {
+    fn of(map: &RangeMap) -> Self {
+        match map.projection {
+            Projection::Orthographic { .. } => Self::Parallel(map.pose.transform_vector3(DVec3::NEG_Z)),
+            Projection::Pinhole { .. } | Projection::Spherical { .. } => Self::From(map.pose.translation),
+        }
+    }
+
+    /// The direction of the ray through a point.
+    fn at(&self, xyz: DVec3) -> DVec3 {
+        match *self {
+            Self::Parallel(direction) => direction,
+            Self::From(scanner) => (xyz - scanner).normalize_or_zero(),
         }
     }
 }
@@ -78,6 +143,8 @@ pub(super) enum Look {
     /// Far in front of what was measured, with that confidence.
     InFront(f64),
     Behind,
+    /// So far behind that it is not taken for solid.
+    Beyond,
     Near {
         distance: f64,
         weight: f64,
@@ -85,69 +152,132 @@ pub(super) enum Look {
     },
 }
 
-/// The data term: F = −Σ V(n) c μ w(D) D. All but V is looked up once a voxel and kept.
+/// The data term F = −Σ V(n) c μ w(ρ) ρ with ρ = D + φ/(n·l): how far the ray through a voxel misses what was measured where it meets the
+/// surface. D and c μ are looked up once a voxel and kept; ρ follows the surface, so that F is nearly the same along a normal and vanishes at rest.
 pub(super) struct Forces<'a> {
     terms: &'a [Term<'a>],
     transform: Transform,
+    run: &'a RunOptions,
     /// By the origin of a leaf.
-    known: Mutex<FxHashMap<IVec3, Arc<LeafForces>>>,
+    known: Mutex<FxHashMap<IVec3, Arc<Vec<Sampled>>>>,
+    bytes: AtomicU64,
+    failure: OnceLock<EditError>,
+    /// The bits of the largest Σ V c μ w since it was last asked for.
+    stiffness: AtomicU64,
 }
 
-/// c μ w(D) D of the voxels of a leaf, by number of the map, of those maps that say anything there.
-type LeafForces = Vec<(usize, Box<LeafValues>)>;
+/// What a map says at the voxels of a leaf.
+struct Sampled {
+    /// Number of the map.
+    map: usize,
+    /// D.
+    distance: LeafValues,
+    /// c μ; 0 where it says nothing.
+    weight: LeafValues,
+}
 
 impl<'a> Forces<'a> {
-    pub fn new(terms: &'a [Term<'a>], transform: Transform) -> Self {
-        Self { terms, transform, known: Mutex::default() }
+    pub fn new(terms: &'a [Term<'a>], transform: Transform, run: &'a RunOptions) -> Self {
+        Self {
+            terms,
+            transform,
+            run,
+            known: Mutex::default(),
+            bytes: AtomicU64::new(0),
+            failure: OnceLock::new(),
+            stiffness: AtomicU64::new(0),
+        }
     }
 
-    fn of(&self, origin: IVec3) -> Arc<LeafForces> {
+    /// What went wrong, if anything did.
+    pub fn failure(self) -> Option<EditError> {
+        self.failure.into_inner()
+    }
+
+    /// Whether anything went wrong.
+    pub fn has_failed(&self) -> bool {
+        self.failure.get().is_some()
+    }
+
+    /// The largest Σ V c μ w of a voxel since the last call: what bounds the step.
+    pub fn take_stiffness(&self) -> f64 {
+        f64::from_bits(self.stiffness.swap(0, Ordering::Relaxed))
+    }
+
+    fn of(&self, origin: IVec3, half_width: f64) -> Option<Arc<Vec<Sampled>>> {
         let known = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(forces) = known().get(&origin) {
-            return forces.clone();
+            return Some(forces.clone());
         }
-        let mut forces = Vec::new();
-        for (n, term) in self.terms.iter().enumerate() {
-            let mut values = LeafValues::default();
+        let half = f64::from(LEAF_DIM - 1) / 2.0;
+        let (centre, radius) =
+            (self.transform.index_to_world(origin.as_dvec3() + half), half * 3f64.sqrt() * self.transform.voxel_size());
+        let mut sampled = Vec::new();
+        for (map, term) in self.terms.iter().enumerate() {
+            let reach = CUT * term.width + half_width / RAMP;
+            if !matches!(term.map.look_around(&term.to_scanner, centre, radius, reach), Around::Mixed) {
+                continue;
+            }
+            let (mut distance, mut weight) = (LeafValues::default(), LeafValues::default());
             let mut any = false;
-            for (at, value) in values.0.iter_mut().enumerate() {
+            for at in 0..weight.0.len() {
                 let xyz = self.transform.voxel_to_world(origin + offset_to_local(at));
-                if let Look::Near { distance, weight, .. } = term.at(xyz) {
-                    *value = (weight * distance) as f32;
-                    any |= *value != 0.0;
+                if let Some((d, w)) = term.sample(xyz, reach) {
+                    (distance.0[at], weight.0[at]) = (d as f32, w as f32);
+                    any |= w > 0.0;
                 }
             }
             if any {
-                forces.push((n, Box::new(values)));
+                sampled.push(Sampled { map, distance, weight });
             }
         }
-        let forces = Arc::new(forces);
-        known().insert(origin, forces.clone());
-        forces
+        let bytes = (sampled.len() * size_of::<Sampled>()) as u64;
+        let total = bytes + self.bytes.fetch_add(bytes, Ordering::Relaxed);
+        if let Err(error) = self.run.reserve(NAME, total, "take a larger voxel_size") {
+            let _ = self.failure.set(error);
+            return None;
+        }
+        let sampled = Arc::new(sampled);
+        known().insert(origin, sampled.clone());
+        Some(sampled)
     }
 }
 
 impl SurfaceSpeed for Forces<'_> {
     fn of_leaf(&self, leaf: &LeafSurface<'_>, speed: &mut LeafValues) -> Tally {
         let mut tally = Tally::default();
-        let forces = self.of(leaf.origin);
+        let half_width = f64::from(leaf.background);
+        let Some(sampled) = self.of(leaf.origin, half_width).filter(|_| !self.has_failed()) else {
+            speed.0.fill(0.0);
+            return tally;
+        };
+        let voxel_size = self.transform.voxel_size();
+        let mut stiffest = 0f64;
         for foot in leaf.feet() {
             let normal = self.transform.direction_to_world(foot.normal).normalize_or_zero();
             let xyz = self.transform.voxel_to_world(leaf.origin + offset_to_local(foot.offset));
-            let mut force = 0.0;
-            for (n, values) in forces.iter() {
-                let value = f64::from(values.0[foot.offset]);
-                if value != 0.0 {
-                    let facing = (-normal.dot(self.terms[*n].direction(xyz)) / RAMP).clamp(0.0, 1.0);
-                    force -= facing * value;
+            let (mut force, mut stiffness) = (0.0, 0.0);
+            for Sampled { map, distance, weight } in sampled.iter() {
+                let weight = f64::from(weight.0[foot.offset]);
+                let Some(term) = self.terms.get(*map).filter(|_| weight > 0.0) else { continue };
+                let cosine = -normal.dot(term.rays.at(xyz));
+                if cosine <= 0.0 {
+                    continue;
                 }
+                let miss = f64::from(distance.0[foot.offset]) - foot.depth * voxel_size / cosine.max(RAMP);
+                let weight = weight * term.window(miss) * (cosine / RAMP).min(1.0);
+                force -= weight * miss;
+                stiffness += weight;
             }
             speed.0[foot.offset] = force as f32;
+            stiffest = stiffest.max(stiffness);
             if foot.beside {
                 tally.count += 1.0;
                 tally.squares += force * force;
             }
         }
+        // Positive numbers are in the order of their bits.
+        self.stiffness.fetch_max(stiffest.to_bits(), Ordering::Relaxed);
         tally
     }
 }
@@ -174,6 +304,7 @@ impl<'t, 'a> Votes<'t, 'a> {
                     Background::Unknown => votes.empty += 1,
                 },
                 Around::InFront => votes.in_front = true,
+                Around::Behind if term.thickness.is_finite() => votes.mixed.push(term),
                 Around::Behind => votes.behind += 1,
                 Around::Mixed => votes.mixed.push(term),
             }
@@ -181,37 +312,45 @@ impl<'t, 'a> Votes<'t, 'a> {
         votes
     }
 
+    /// Whether the voxels are inside, if no map must be asked.
+    fn agreed(&self) -> Option<bool> {
+        self.mixed.is_empty().then(|| self.is_inside())
+    }
+
+    /// Inside is what maps see the surface in front of, and none sees through. What no map has in its picture is outside: it is not closed
+    /// off by anything but the end of the pictures.
+    fn is_inside(&self) -> bool {
+        !self.in_front && !self.surely_empty && self.behind > 0 && self.empty <= self.behind
+    }
+
     /// φ₀ at a point, world units: Σ c μ w D / Σ c μ w where the maps say enough; else outside where a map sees through, inside where none does.
     fn value(&self, xyz: DVec3, background: f64) -> f64 {
         let (mut sum, mut weights) = (0.0, 0.0);
-        let Self { mut in_front, mut empty, mut behind, mut surely_empty, .. } = *self;
+        let mut all = Self { mixed: Vec::new(), ..*self };
         for term in &self.mixed {
             match term.at(xyz) {
                 // A ray without an answer is a vote, not a proof.
-                Look::Unseen => empty += usize::from(term.frames(xyz)),
-                Look::Empty => surely_empty = true,
-                Look::InFront(weight) => in_front |= weight > 0.0,
-                Look::Behind => behind += 1,
+                Look::Unseen => all.empty += usize::from(term.frames(xyz)),
+                Look::Empty => all.surely_empty = true,
+                Look::InFront(weight) => all.in_front |= weight > 0.0,
+                Look::Behind => all.behind += 1,
+                Look::Beyond => all.empty += 1,
                 Look::Near { distance, weight, .. } => {
                     sum += weight * distance;
                     weights += weight;
-                    in_front |= distance > 0.0 && weight > 0.0;
+                    all.in_front |= distance > 0.0 && weight > 0.0;
+                    all.behind += usize::from(distance < 0.0);
                 }
             }
         }
         if weights > ENOUGH {
             return (sum / weights).clamp(-background, background);
         }
-        if in_front || surely_empty || empty > behind { background } else { -background }
+        if all.is_inside() { -background } else { background }
     }
 }
 
 impl Term<'_> {
-    /// The direction of the ray to a point, in the world.
-    fn direction(&self, xyz: DVec3) -> DVec3 {
-        self.map.pose.transform_vector3(self.map.projection.direction(self.to_scanner.transform_point3(xyz)))
-    }
-
     /// Whether the point is within the map's picture.
     fn frames(&self, xyz: DVec3) -> bool {
         let Some((pixel, _)) = self.map.projection.project(self.to_scanner.transform_point3(xyz)) else { return false };
@@ -235,49 +374,67 @@ pub(super) fn first_surface(
     run.reserve(NAME, (count as u64).saturating_mul(16), "take a larger voxel_size")?;
     let task = run.task("first estimate", count as u64);
     let place_of = |n: usize| IVec3::new((n / (sy * sz)) as i32, (n / sz % sy) as i32, (n % sz) as i32);
-    let values_of = |n: usize| {
-        let origin = (first + place_of(n)) * LEAF_DIM;
+    let origin_of = |n: usize| (first + place_of(n)) * LEAF_DIM;
+    let half = f64::from(LEAF_DIM - 1) / 2.0;
+    let votes_of = |n: usize| {
+        let centre = transform.index_to_world(origin_of(n).as_dvec3() + half);
+        Votes::new(terms, centre, half * 3f64.sqrt() * transform.voxel_size())
+    };
+    // The box closes what no map does.
+    let within = |ijk: IVec3| ijk.cmpgt(lo).all() && ijk.cmplt(hi).all();
+    // The sign of leaves of which all maps say the same.
+    let mut signs: Vec<Option<bool>> = (0..count)
+        .into_par_iter()
+        .with_min_len(16)
+        .map(|n| {
+            task.advance(1);
+            if run.is_cancelled() {
+                return Some(false);
+            }
+            let (origin, votes) = (origin_of(n), votes_of(n));
+            let inside = votes.agreed()?;
+            let whole = within(origin) && within(origin + (LEAF_DIM - 1));
+            (whole || !inside).then_some(inside)
+        })
+        .collect();
+    run.check(NAME)?;
+    let split: Vec<usize> = (0..count).filter(|&n| signs[n].is_none()).collect();
+    run.reserve(NAME, split.len() as u64 * 5000, "take a larger voxel_size")?;
+    let values_of = |&n: &usize| {
+        let (origin, votes) = (origin_of(n), votes_of(n));
         let mut values = LeafValues::default();
-        let half = f64::from(LEAF_DIM - 1) / 2.0;
-        let centre = transform.index_to_world(origin.as_dvec3() + half);
-        let votes = Votes::new(terms, centre, half * 3f64.sqrt() * transform.voxel_size());
         for (at, value) in values.0.iter_mut().enumerate() {
             let ijk = origin + offset_to_local(at);
-            // The box closes what no map does.
-            let within = ijk.cmpgt(lo).all() && ijk.cmplt(hi).all();
-            *value = match within {
+            *value = match within(ijk) && !run.is_cancelled() {
                 true => votes.value(transform.voxel_to_world(ijk), f64::from(background)) as f32,
                 false => background,
             };
         }
-        (origin, values)
+        (n, values)
     };
-    // Whether a leaf is needed: its own sign if it has one.
-    let signs: Vec<Option<bool>> = (0..count)
-        .into_par_iter()
-        .with_min_len(16)
-        .map(|n| {
-            if run.is_cancelled() {
-                return Some(false);
-            }
-            task.advance(1);
-            values_of(n).1.one_sign()
-        })
-        .collect();
+    let mut found: Vec<(usize, LeafValues)> = split.par_iter().with_min_len(4).map(values_of).collect();
     run.check(NAME)?;
+    for (n, values) in &found {
+        signs[*n] = values.one_sign();
+    }
     let sign = |place: IVec3| match place.cmpge(IVec3::ZERO).all() && place.cmplt(size).all() {
         true => signs[((place.x * size.y + place.y) * size.z + place.z) as usize],
         false => Some(false),
     };
-    let needed: Vec<usize> = (0..count)
-        .filter(|&n| {
-            let place = place_of(n);
-            let own = sign(place);
-            own.is_none() || (0..27).any(|k| sign(place + IVec3::new(k / 9 - 1, k / 3 % 3 - 1, k % 3 - 1)) != own)
-        })
-        .collect();
-    run.reserve(NAME, needed.len() as u64 * 5000, "take a larger voxel_size")?;
-    let leaves: Vec<(IVec3, LeafValues)> = needed.par_iter().with_min_len(16).map(|&n| values_of(n)).collect();
+    // Leaves of one sign beside those of the other one are wanted as well.
+    let needed = |n: usize| {
+        let (place, own) = (place_of(n), signs[n]);
+        own.is_none() || (0..27).any(|k| sign(place + IVec3::new(k / 9 - 1, k / 3 % 3 - 1, k % 3 - 1)) != own)
+    };
+    found.retain(|(n, _)| needed(*n));
+    let mut is_split = vec![false; count];
+    split.iter().for_each(|&n| is_split[n] = true);
+    let whole: Vec<usize> = (0..count).filter(|&n| !is_split[n] && needed(n)).collect();
+    run.reserve(NAME, (found.len() + whole.len()) as u64 * 5000, "take a larger voxel_size")?;
+    let filled = |n: usize| LeafValues::filled(if signs[n] == Some(true) { -background } else { background });
+    found.extend(whole.into_iter().map(|n| (n, filled(n))));
+    found.sort_unstable_by_key(|(n, _)| *n);
+    let leaves: Vec<(IVec3, LeafValues)> = found.into_iter().map(|(n, values)| (origin_of(n), values)).collect();
     let origins: Vec<IVec3> = leaves.iter().map(|leaf| leaf.0).collect();
     let mut grid = Grid::from_origins(background, &origins);
     let by_origin: FxHashMap<IVec3, usize> = origins.iter().enumerate().map(|(n, o)| (*o, n)).collect();
@@ -325,24 +482,15 @@ pub(super) fn without_specks(level_set: &LevelSet, part: f64, run: &RunOptions) 
 
 /// The triangles of each connected piece, in the order of their first.
 fn pieces(mesh: &TriangleMesh) -> Vec<Vec<[u32; 3]>> {
-    let mut parent: Vec<u32> = (0..mesh.positions.len() as u32).collect();
-    fn root(parent: &mut [u32], mut v: u32) -> u32 {
-        while parent[v as usize] != v {
-            parent[v as usize] = parent[parent[v as usize] as usize];
-            v = parent[v as usize];
-        }
-        v
-    }
+    let joined = UnionFind::new(mesh.positions.len());
     for &[a, b, c] in &mesh.triangles {
-        for (v, w) in [(a, b), (b, c)] {
-            let (v, w) = (root(&mut parent, v), root(&mut parent, w));
-            parent[v.max(w) as usize] = v.min(w);
-        }
+        joined.join(a, b);
+        joined.join(b, c);
     }
     let mut place: FxHashMap<u32, usize> = FxHashMap::default();
     let mut pieces: Vec<Vec<[u32; 3]>> = Vec::new();
     for triangle in &mesh.triangles {
-        let root = root(&mut parent, triangle[0]);
+        let root = joined.root(triangle[0]);
         let n = *place.entry(root).or_insert_with(|| {
             pieces.push(Vec::new());
             pieces.len() - 1

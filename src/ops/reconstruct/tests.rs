@@ -62,17 +62,8 @@ fn six_maps(solid: fn(DVec3) -> f64, noise: f64, perspective: bool) -> RangeSet 
                 ranges.push(if hit { (t + noise * random.normal()) as f32 } else { f32::NAN });
             }
         }
-        RangeMap {
-            name: format!("view {n}"),
-            projection,
-            pose,
-            width: PIXELS,
-            height: PIXELS,
-            weights: vec![1.0; ranges.len()],
-            ranges,
-            noise: (noise > 0.0).then_some(noise),
-            background: Background::Empty,
-        }
+        let map = RangeMap::new(format!("view {n}"), projection, pose, PIXELS, ranges);
+        RangeMap { noise: (noise > 0.0).then_some(noise), background: Background::Empty, ..map }
     });
     RangeSet { maps: maps.collect(), ..RangeSet::default() }
 }
@@ -98,8 +89,11 @@ fn error(level_set: &LevelSet, exact: fn(DVec3) -> f64) -> (f64, f64) {
 #[test]
 fn a_torus_from_six_noisy_maps() {
     let truth = 2.0 * std::f64::consts::PI.powi(2) * MAJOR * MINOR * MINOR;
-    for (perspective, low_pass, limit) in [(false, 0.5, 0.25), (true, 0.5, 0.25), (false, 0.0, 0.35)] {
-        let params = Reconstruct { low_pass: VoxelLength::new(low_pass), ..voxels() };
+    // The prior shifts the surface inwards by 2βH over the maps that see it: of maps from one point those are fewer, since they do not trust their edges.
+    for (perspective, low_pass, beta, limit) in
+        [(false, 0.5, 2.0, 0.25), (true, 0.5, 1.0, 0.25), (false, 0.0, 2.0, 0.35)]
+    {
+        let params = Reconstruct { low_pass: VoxelLength::new(low_pass), beta, ..voxels() };
         let (level_set, summary) = made(six_maps(torus, 0.2 * MINOR, perspective), &params);
         let (rms, mean) = error(&level_set, torus);
         let measures = level_set.measure(&RunOptions::default()).unwrap();
@@ -128,8 +122,7 @@ fn without_noise_and_prior_the_torus_is_met() {
     let (level_set, _) = made(six_maps(torus, 0.0, false), &params);
     let (rms, mean) = error(&level_set, torus);
     println!("no noise: rms {rms:.3} mean {mean:+.3}");
-    // Measured 0.114. With D at the surface point nearest to each voxel, instead of once a voxel, it was 0.079: below the 0.1 that is wanted.
-    assert!(rms < 0.12, "{rms}");
+    assert!(rms < 0.1, "{rms}");
 }
 
 /// A hall of 9 x 4.4 x 5.2 with a table, a column and a ball; positive in the air.
@@ -145,9 +138,8 @@ fn hall(p: DVec3) -> f64 {
     walls.min(table).min(column).min(ball)
 }
 
-#[test]
-fn a_hall_seen_by_twelve_turning_scanners() {
-    let (columns, rows, noise) = (160, 70, 0.05);
+/// What twelve turning scanners in the hall measure.
+fn hall_maps(columns: i32, rows: i32, noise: f64) -> Vec<RangeMap> {
     let mut random = Noise(7);
     let mut maps = Vec::new();
     for n in 0..12 {
@@ -171,18 +163,15 @@ fn a_hall_seen_by_twelve_turning_scanners() {
                 ranges.push((t + noise * random.normal()) as f32);
             }
         }
-        maps.push(RangeMap {
-            name: format!("scanner {n}"),
-            projection,
-            pose,
-            width: columns as usize,
-            height: rows as usize,
-            weights: vec![1.0; ranges.len()],
-            ranges,
-            noise: Some(noise),
-            background: Background::Unknown,
-        });
+        let map = RangeMap::new(format!("scanner {n}"), projection, pose, columns as usize, ranges);
+        maps.push(RangeMap { noise: Some(noise), ..map });
     }
+    maps
+}
+
+#[test]
+fn a_hall_seen_by_twelve_turning_scanners() {
+    let maps = hall_maps(160, 70, 0.05);
     let params =
         Reconstruct { voxel_size: Some(WorldLength::new(0.12)), iterations: 32, beta: 0.5, ..Reconstruct::default() };
     let (level_set, summary) = made(RangeSet { maps, ..RangeSet::default() }, &params);
@@ -272,4 +261,41 @@ fn refusals() {
     let mut set = six_maps(torus, 0.0, false);
     set.maps.iter_mut().for_each(|map| map.ranges.iter_mut().for_each(|r| *r = f32::INFINITY));
     assert_eq!(reconstruct(set, &voxels(), &run).err().unwrap().exit_code(), 2);
+}
+
+/// A ball seen from one side is a shell as thick as asked, in its colours; what no map sees is listed.
+#[test]
+fn thin_shells_holes_and_colours() {
+    fn ball(p: DVec3) -> f64 {
+        p.length() - 20.0
+    }
+    let mut set = six_maps(ball, 0.0, false);
+    set.maps = vec![set.maps.remove(4)];
+    let map = &mut set.maps[0];
+    map.colors = (0..map.ranges.len())
+        .map(|at| if at % map.width < map.width / 2 { [255, 0, 0] } else { [0, 0, 255] })
+        .collect();
+    let (whole, _) = made(set.clone(), &Reconstruct { beta: 0.0, ..voxels() });
+    let thickness = Some(WorldLength::new(8.0));
+    let (shell, summary) = made(set, &Reconstruct { beta: 0.0, thickness, ..voxels() });
+    let volume = |level_set: &LevelSet| level_set.measure(&RunOptions::default()).unwrap().volume;
+    // A cylinder over the disc, but for its rim, where it is not trusted.
+    let expected = std::f64::consts::PI * 400.0 * 8.0;
+    println!("shell {} of {expected}, whole {}, {:?}", volume(&shell), volume(&whole), summary.details["unseen_part"]);
+    assert!((volume(&shell) / expected - 1.0).abs() < 0.1 && volume(&whole) > 1.5 * expected);
+    let holes = summary.details["holes"].as_array().unwrap();
+    let (area, of_largest) = (&summary.details["unseen_area"], &holes[0]["area"]);
+    assert!(of_largest.as_f64().unwrap() > 0.95 * area.as_f64().unwrap(), "{holes:?}");
+    // The back lies below the middle of the front.
+    assert!(holes[0]["centre"][2].as_f64().unwrap() < 10.0, "{holes:?}");
+    let mesh = summary.colored.unwrap();
+    let mut side = [0.0; 2];
+    for (p, color) in mesh.positions.iter().zip(mesh.colors.as_ref().unwrap()) {
+        assert!(color[3] == 1.0 && (color[0] + color[2] - 1.0).abs() < 1e-3 && color[1] == 0.0, "{color:?}");
+        if p.x.abs() > 1.0 && p.z > 10.0 && ball(*p).abs() < 1.0 {
+            side[usize::from(p.x > 0.0)] += f64::from(color[0]);
+            assert!(color[0] == 0.0 || color[0] == 1.0, "{p} {color:?}");
+        }
+    }
+    assert!(side[0].min(side[1]) == 0.0 && side[0].max(side[1]) > 100.0, "{side:?}");
 }
