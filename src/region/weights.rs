@@ -48,9 +48,7 @@ impl RegionWeights {
             known: Paged::default(),
             leaves: LeafSet::default(),
         };
-        let touched = |id: &LeafId| range(grid, transform, region, *id)[1] > 0.0;
-        let touched: Vec<_> = grid.leaves().par_iter().copied().filter(touched).collect();
-        weights.evaluate(grid, transform, region, &touched.into_iter().collect());
+        weights.evaluate(grid, transform, region, &touched_leaves(grid, transform, region));
         weights
     }
 
@@ -146,6 +144,13 @@ impl RegionWeights {
     pub fn positive(&self, id: LeafId) -> LeafMask {
         *self.positive.get(id)
     }
+}
+
+/// The leaves of `grid` that `region` may touch.
+pub fn touched_leaves(grid: &Grid, transform: &Transform, region: &dyn Region) -> LeafSet {
+    let touched = |id: &LeafId| range(grid, transform, region, *id)[1] > 0.0;
+    let touched: Vec<_> = grid.leaves().par_iter().copied().filter(touched).collect();
+    touched.into_iter().collect()
 }
 
 /// Limits of α in a leaf.
