@@ -113,7 +113,8 @@ mod tests {
 
     #[test]
     fn many_positions_at_once_have_the_weights_of_each() {
-        let points: Vec<DVec3> = (0..60).map(|i| DVec3::new(f64::from(i) * 0.7, f64::from(i * i % 7) * 0.3, 0.0)).collect();
+        let points: Vec<DVec3> =
+            (0..60).map(|i| DVec3::new(f64::from(i) * 0.7, f64::from(i * i % 7) * 0.3, 0.0)).collect();
         // A ramp, and a step.
         for reach in [[7.0, 9.0], [8.0, 8.0], [0.0, 3.0]] {
             let region = Near::new(&points, reach).unwrap();
@@ -125,7 +126,10 @@ mod tests {
             let each: Vec<f32> = positions.iter().map(|p| region.weight(*p)).collect();
             assert!(alpha.iter().zip(&each).all(|(a, b)| a.to_bits() == b.to_bits()));
             let count = |of: fn(f32) -> bool| each.iter().filter(|a| of(**a)).count();
-            assert!(count(|a| a == 0.0) > 500 && count(|a| a == 1.0) + count(|a| a > 0.0 && a < 1.0) > 500, "{reach:?}");
+            assert!(
+                count(|a| a == 0.0) > 500 && count(|a| a == 1.0) + count(|a| a > 0.0 && a < 1.0) > 500,
+                "{reach:?}"
+            );
         }
     }
 
