@@ -49,7 +49,7 @@ const FACING: f64 = 0.05;
 /// Steps without progress after which a flow is at rest.
 const PATIENCE: u32 = 8;
 
-/// What counts as progress, in voxels: a fall of the largest gap, or of the mean distance of what is drawn from its targets.
+/// What counts as progress, in voxels: a fall of the largest gap, or of the mean or least distance of what is drawn from its targets.
 const PROGRESS: f64 = 0.01;
 
 /// Distance from the surface, in voxels, up to which a target is next to it.
@@ -72,6 +72,8 @@ struct LeafFelt {
     /// Sum over the voxels that are drawn, of what they have still to go if they are pushed, and their number.
     distance: f64,
     count: f64,
+    /// Least distance from a target that is not reached.
+    nearest: Option<f64>,
     /// The targets that are next to the surface.
     touched: Vec<Touched>,
 }
@@ -83,12 +85,13 @@ struct Touched {
     towards: DVec3,
 }
 
-/// What all voxels feel: the largest of each, the mean distance.
+/// What all voxels feel: the largest of each, the mean and the least distance.
 struct Felts {
     fastest: f64,
     travel: f64,
     gap: f64,
     distance: f64,
+    nearest: f64,
 }
 
 /// The motion towards the target.
@@ -108,8 +111,8 @@ pub(super) struct Drawing<'a> {
     /// Origins of leaves, and the voxels of the band in them that have moved.
     moved: FxHashMap<IVec3, LeafMask>,
     gap: f64,
-    /// Largest gap and mean distance from the targets at the last progress, and the steps left to make some.
-    least: [f64; 2],
+    /// Largest gap, mean and least distance from the targets at the last progress, and the steps left to make some.
+    least: [f64; 3],
     patience: u32,
     /// Longest Euler step.
     substep: f64,
@@ -133,7 +136,7 @@ impl<'a> Drawing<'a> {
             leaves: FxHashSet::default(),
             moved: FxHashMap::default(),
             gap: 0.0,
-            least: [f64::INFINITY; 2],
+            least: [f64::INFINITY; 3],
             patience: PATIENCE,
             substep: f64::INFINITY,
             stepped: None,
@@ -154,7 +157,9 @@ impl<'a> Drawing<'a> {
             *aim = (*aim + towards * (side * short)).clamp_length_max(FARTHEST_AIM);
             missed |= short.abs() > CLOSE_ENOUGH;
         }
-        (self.least, self.patience) = ([f64::INFINITY; 2], PATIENCE);
+        if missed {
+            (self.least, self.patience) = ([f64::INFINITY; 3], PATIENCE);
+        }
         missed
     }
 
@@ -203,6 +208,9 @@ impl<'a> Drawing<'a> {
             felt.fastest = felt.fastest.max(speed.abs());
             if alpha >= DRAWN && voxel.share >= FACING {
                 felt.gap = felt.gap.max(voxel.gap);
+                if voxel.gap >= CLOSED {
+                    felt.nearest = Some(felt.nearest.map_or(voxel.distance, |nearest| nearest.min(voxel.distance)));
+                }
                 if voxel.distance < BESIDE {
                     felt.touched.push(Touched { point: voxel.target.point, towards: voxel.towards });
                 }
@@ -268,6 +276,7 @@ impl<'a> Drawing<'a> {
             travel: most(|f| f.travel),
             gap: most(|f| f.gap),
             distance: felt.iter().map(|f| f.distance).sum::<f64>() / count.max(1.0),
+            nearest: felt.iter().filter_map(|f| f.nearest).fold(f64::INFINITY, f64::min),
         };
         let by_leaf = |speeds: Vec<Option<Box<LeafValues>>>| -> Speeds {
             grid.leaves().iter().zip(speeds).filter_map(|(id, speeds)| Some((id.index(), speeds?))).collect()
@@ -307,7 +316,7 @@ impl Motion for Drawing<'_> {
         if felts.fastest == 0.0 || (!endless && self.gap < CLOSED) {
             return None;
         }
-        for (least, now) in self.least.iter_mut().zip([felts.gap, felts.distance]) {
+        for (least, now) in self.least.iter_mut().zip([felts.gap, felts.distance, felts.nearest]) {
             if now < *least - PROGRESS {
                 (*least, self.patience) = (now, PATIENCE);
             }
