@@ -76,8 +76,8 @@ enum Side {
 /// A leaf with its first voxel.
 pub(crate) type Leaf = (IVec3, LeafValues, LeafMask);
 
-/// The leaves of a band, those of each tile together, tiles in the order of their origins; only of those tiles for whose first and last
-/// voxel `wanted` holds.
+/// The leaves of a band, those of each tile together, tiles in the order of their origins; only those for whose first and last voxel `wanted`
+/// holds, as it must for every box around one.
 pub(super) fn leaves_of_band(
     operation: &str,
     surface: &IsoSurface,
@@ -87,7 +87,7 @@ pub(super) fn leaves_of_band(
     wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
     run: &RunOptions,
 ) -> Result<Vec<Vec<Leaf>>> {
-    let search = Search { sources: Sources::new(surface, field), surface, field, iso, band };
+    let search = Search { sources: Sources::new(surface, field), surface, field, iso, band, wanted: &wanted };
     let mut tiles = search.sources.tiles_within(band.reach());
     tiles.retain(|&tile| {
         let (first, last) = tile_bounds(tile);
@@ -192,6 +192,7 @@ struct Search<'a> {
     field: &'a Grid,
     iso: f32,
     band: Band,
+    wanted: &'a (dyn Fn(IVec3, IVec3) -> bool + Sync),
 }
 
 impl Search<'_> {
@@ -268,6 +269,10 @@ impl Search<'_> {
     ) {
         let Some((list, lists)) = lists.split_first_mut() else { return };
         for half in block.halves() {
+            let first = tile + half.origin;
+            if half.edge >= LEAF_DIM && !(self.wanted)(first, first + (half.edge - 1)) {
+                continue;
+            }
             let (side, nearest) = self.enter(tile, half, clusters, from, list);
             let half = Block { nearest, ..half };
             if side != Side::Near {
@@ -346,6 +351,10 @@ impl Search<'_> {
         let origin = tile + block.origin;
         let field = &self.field.values(self.field.find(origin)).0;
         for half in block.halves() {
+            let first = tile + half.origin;
+            if half.edge >= LEAF_DIM && !(self.wanted)(first, first + (half.edge - 1)) {
+                continue;
+            }
             let (side, mut nearest) = self.enter(tile, half, clusters, from, list);
             let mut squared = [[f32::INFINITY; BLOCK as usize]; (BLOCK * BLOCK) as usize];
             if side == Side::Near {

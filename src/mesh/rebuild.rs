@@ -8,13 +8,13 @@
 
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
-use rustc_hash::FxHashSet;
+use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::from_levelset::{leaves_the_band, surface_of};
-use super::nearest::{Band, Leaf, TILE, leaves_of_band};
+use super::nearest::{Band, Leaf, leaves_of_band};
 use super::{Bvh, MeshToLevelSet, TriangleMesh, level_set_to_mesh, mesh_to_level_set};
 use crate::error::{EditError, Result};
-use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, MAX_COORD, Transform};
+use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafSet, MAX_COORD, Transform};
 use crate::levelset::isosurface::IsoSurface;
 use crate::levelset::{BYTES_A_LEAF, LevelSet, background, grid_of_parts};
 use crate::run::RunOptions;
@@ -82,8 +82,8 @@ pub fn rebuild(level_set: &LevelSet, what: &Rebuild, run: &RunOptions) -> Result
     Ok(LevelSet::new(grid_of_parts(background, &leaves), transform))
 }
 
-/// The level set with exact distances beyond its band, up to `half_width` voxels from the surface, wherever `wanted` holds for the first and
-/// last voxel of a box that is near the surface. The voxels of its own band keep their bits.
+/// The level set with exact distances beyond its band, up to `half_width` voxels from the surface, in the leaves for whose first
+/// and last voxel `wanted` holds, as it must for every box around one. The voxels of its own band keep their bits.
 ///
 /// The rebuilt distances are those of polygons, the others what they were: where the two meet they differ by the error of the polygons.
 pub fn widened(
@@ -117,24 +117,39 @@ pub fn widened(
     Ok(LevelSet::new(grid_of_parts(background, &parts), transform))
 }
 
-/// The same surface with exact distances in the tiles of space for whose first and last voxel `wanted` holds; all else stays as it is.
+/// The same surface with exact distances in the leaves for whose first and last voxel `wanted` holds, as it must for every box around one; all else
+/// stays as it is, in the pages that it shares.
 pub fn rebuild_where(
     level_set: &LevelSet,
     wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
     run: &RunOptions,
 ) -> Result<LevelSet> {
-    let (field, half_width) = (level_set.grid(), level_set.half_width());
-    let mut parts = rebuilt_leaves(level_set, half_width, &wanted, run)?;
-    let stays = |origin: IVec3| {
-        let first = origin.div_euclid(IVec3::splat(TILE)) * TILE;
-        !wanted(first, first + (TILE - 1))
-    };
-    let others = field.leaves().par_iter().filter(|&&id| stays(field.origin(id)));
-    parts.push(others.map(|&id| (field.origin(id), field.values(id).clone(), field.mask(id))).collect());
-    Ok(LevelSet::new(grid_of_parts(level_set.background(), &parts), *level_set.transform()))
+    let (mut grid, background) = (level_set.grid().clone(), level_set.background());
+    let rebuilt = rebuilt_leaves(level_set, level_set.half_width(), &wanted, run)?;
+    let mut missing: Vec<IVec3> =
+        rebuilt.iter().flatten().map(|leaf| leaf.0).filter(|&o| grid.find(o).is_sentinel()).collect();
+    missing.sort_unstable_by_key(|o| (o.x, o.y, o.z));
+    grid.add_leaves(&missing);
+    let new: FxHashMap<LeafId, &Leaf> = rebuilt.iter().flatten().map(|leaf| (grid.find(leaf.0), leaf)).collect();
+    let is_wanted = |id: &LeafId| wanted(grid.origin(*id), grid.origin(*id) + (LEAF_DIM - 1));
+    let leaves: LeafSet = grid.leaves().iter().copied().filter(is_wanted).collect();
+    grid.update(&leaves, |id, values, mask| match new.get(&id) {
+        Some((_, there, active)) => {
+            values.clone_from(there);
+            *mask = *active;
+        }
+        // Farther from the surface than the band.
+        None => {
+            values.0.iter_mut().for_each(|value| *value = if *value < 0.0 { -background } else { background });
+            *mask = LeafMask::EMPTY;
+        }
+    });
+    grid.prune(&leaves);
+    Ok(LevelSet::new(grid, *level_set.transform()))
 }
 
-/// The leaves of a band of `half_width` voxels with exact distances, of boxes for whose first and last voxel `wanted` holds.
+/// The leaves of a band of `half_width` voxels with exact distances, those for whose first and last voxel `wanted` holds, as it must for every box
+/// around one.
 pub(crate) fn rebuilt_leaves(
     level_set: &LevelSet,
     half_width: f32,
@@ -234,7 +249,6 @@ fn index_bounds(surface: &IsoSurface, field: &Grid, reach: f64) -> Result<(IVec3
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::grid::LeafMask;
     use crate::levelset::testing::{ball, block, box_distance, noise, sampled, torus};
     use crate::stencil::simd::{Isa, choose};
 

@@ -25,10 +25,11 @@ use super::params::{VoxelLength, words};
 use super::registry::{Arity, Operator, Outcome, Summary};
 use super::solver::{EvolutionOptions, SMOOTHING, evolved};
 use crate::error::{EditError, Result};
+use crate::grid::offset_to_local;
 use crate::levelset::{CurvatureKind, LevelSet, curvature_of, curve_length};
 use crate::mesh::with_half_width;
 use crate::pde::{AnisotropicGaussian, CurvatureFlow, CutOff, Direction, FlowCurvature, filter_anisotropic};
-use crate::region::{Combined, Near, NearSurface, Region, RegionWeights};
+use crate::region::{Combined, Near, NearSurface, Region, touched_leaves};
 use crate::run::RunOptions;
 
 words! {
@@ -316,14 +317,19 @@ pub fn blend(first: &LevelSet, second: &LevelSet, params: &Blend, run: &RunOptio
 /// The largest curvature, against which a flow of `direction` works, of the surface where the region is 1.
 fn sharpest(level_set: &LevelSet, region: &dyn Region, direction: Direction, run: &RunOptions) -> Result<Option<f64>> {
     let grid = level_set.grid();
-    let weights = RegionWeights::new(grid, level_set.transform(), region);
+    let leaves = touched_leaves(grid, level_set.transform(), region);
     let nearest = (0.5 * level_set.voxel_size()) as f32;
     let of_kind = |kind, sign: f32| -> Result<f32> {
-        let field = curvature_of(level_set, kind, weights.leaves(), run)?;
+        let field = curvature_of(level_set, kind, &leaves, run)?;
         let of_leaf = |id| {
-            let (curved, alpha, phi) = (&field.grid().values(id).0, &weights.alpha(id).0, &grid.values(id).0);
-            let on_surface = |&at: &usize| phi[at].abs() < nearest && alpha[at] == 1.0;
-            field.grid().mask(id).iter().filter(on_surface).map(|at| sign * curved[at]).fold(0.0, f32::max)
+            let (curved, phi) = (&field.grid().values(id).0, &grid.values(id).0);
+            let on_surface = |at: &usize| phi[*at].abs() < nearest && sign * curved[*at] > 0.0;
+            let found: Vec<usize> = field.grid().mask(id).iter().filter(on_surface).collect();
+            let place = |at: &usize| level_set.transform().voxel_to_world(grid.origin(id) + offset_to_local(*at));
+            let mut alpha = vec![0.0; found.len()];
+            region.weights(&found.iter().map(place).collect::<Vec<_>>(), &mut alpha);
+            let full = found.iter().zip(alpha).filter(|(_, alpha)| *alpha >= 1.0);
+            full.map(|(at, _)| sign * curved[*at]).fold(0.0, f32::max)
         };
         Ok(grid.map_leaves(of_leaf).into_iter().fold(0.0, f32::max))
     };

@@ -23,6 +23,7 @@ use crate::mesh::{Rebuild, rebuild, rebuild_where, with_half_width};
 use crate::pde::Report;
 use crate::region::{Region, RegionWeights};
 use crate::run::RunOptions;
+use crate::stencil::Cube;
 
 /// How far an operator acts, in voxels.
 pub(super) struct Reach {
@@ -77,7 +78,11 @@ pub(super) fn kept(original: &LevelSet, mut edited: LevelSet, region: &dyn Regio
     let lost: Vec<IVec3> = old.leaves().iter().map(|&id| old.origin(id)).filter(lost).collect();
     edited.grid_mut().add_leaves(&lost);
     let grid = edited.grid().clone();
-    let here: LeafSet = grid.leaf_set().iter().filter(|&id| !old.find(grid.origin(id)).is_sentinel()).collect();
+    let differs = |id: LeafId| match old.find(grid.origin(id)) {
+        from if from.is_sentinel() => false,
+        from => from != id || !grid.shares_storage(old, id),
+    };
+    let here: LeafSet = grid.leaf_set().iter().filter(|&id| differs(id)).collect();
     edited.grid_mut().update(&here, |id, values, mask| {
         let from = old.find(grid.origin(id));
         for at in merge.kept(from).iter() {
@@ -176,12 +181,13 @@ pub(super) fn held(
     Ok(report)
 }
 
-/// Exact distances where a region acts.
+/// Exact distances where a region acts, and as far from there as they can have changed.
 fn restored(level_set: &LevelSet, region: &dyn Region, run: &RunOptions) -> Result<LevelSet> {
-    let around = IndexBox::around(region, level_set).map(|b| b.padded(f64::from(level_set.half_width()) + 1.0));
+    let (transform, margin) = (level_set.transform(), f64::from(level_set.half_width()) + 1.0);
     let touched = |first: IVec3, last: IVec3| {
-        let touches = |b: &IndexBox| first.as_dvec3().cmple(b.hi).all() && last.as_dvec3().cmpge(b.lo).all();
-        around.as_ref().is_none_or(touches)
+        let (centre, radius) = ((first + last).as_dvec3() / 2.0, (last - first).as_dvec3().length() / 2.0);
+        let radius = (radius + margin) * transform.voxel_size();
+        region.weights_within(transform.index_to_world(centre), radius)[1] > 0.0
     };
     rebuild_where(level_set, touched, run)
 }
@@ -370,24 +376,29 @@ impl<'a> Merge<'a> {
         let around = |id: LeafId| grid.neighbours()[id.index()].into_iter().filter(|id| !id.is_sentinel());
         let leaves: LeafSet = changed.iter().flat_map(around).collect();
         let leaves: Vec<LeafId> = leaves.iter().collect();
-        let seeds: Vec<(IVec3, f32)> = leaves
-            .par_iter()
-            .flat_map_iter(|&id| {
-                let origin = grid.origin(id);
-                let kept = self.kept(self.old.grid().find(origin));
-                let mut accessor = grid.accessor();
-                let mut found = Vec::new();
-                for at in kept.iter() {
-                    let (ijk, value) = (origin + offset_to_local(at), grid.values(id).0[at]);
-                    if steps.iter().any(|(step, most)| side * (accessor.value(ijk + *step) - value) > *most) {
-                        found.push((ijk, value));
-                    }
+        // Places in a cube of a leaf and the voxels around it.
+        let beside: Vec<_> = steps.iter().map(|(step, most)| (*step + 1, *most)).collect();
+        let seeds_of = |cube: &mut Cube, &id: &LeafId| {
+            let origin = grid.origin(id);
+            let kept = self.kept(self.old.grid().find(origin));
+            let mut found = Vec::new();
+            if kept.is_empty() {
+                return found;
+            }
+            cube.gather(grid.value_pages(), &grid.neighbours()[id.index()], kept);
+            for at in kept.iter() {
+                let (local, value) = (offset_to_local(at), grid.values(id).0[at]);
+                let value_at = |ijk: IVec3| cube.slab(ijk.x as usize)[(ijk.y * (LEAF_DIM + 2) + ijk.z) as usize];
+                if beside.iter().any(|(step, most)| side * (value_at(local + *step) - value) > *most) {
+                    found.push((origin + local, value));
                 }
-                found
-            })
-            .collect();
+            }
+            found
+        };
+        let seeds: Vec<Vec<(IVec3, f32)>> =
+            leaves.par_iter().map_init(|| Cube::new(1), |cube, id| seeds_of(cube, id)).collect();
         let mut cut: FxHashMap<IVec3, f32> = FxHashMap::default();
-        let mut queue: VecDeque<(IVec3, f32)> = seeds.into();
+        let mut queue: VecDeque<(IVec3, f32)> = seeds.concat().into();
         let mut accessor = grid.accessor();
         // The least value over all paths from kept voxels, whatever the order.
         while let Some((ijk, value)) = queue.pop_front() {

@@ -7,6 +7,10 @@
 //! Each step is one rebuild ([`crate::mesh::rebuild`]): exact distances to the polygonised surface, at any distance,
 //! no stepping; `offset --like openvdb` takes steps, to compare. Eroding everything away leaves an empty level set, which is legal.
 //!
+//! A second opening should change nothing. It changes a box by 0.11 voxel, but single voxels on the rounded edge of a lens by 0.56 and on scanned models by 1.5
+//! (the goat's head at 128 voxels, opened by 3: 99 % by less than 0.28): the eroded surface has edges that differences of the field do not find. A second
+//! closing changes 99 % by less than 0.12, single voxels by up to 0.6.
+//!
 //! In a region the result is φ' = (1 − α) φ + α φ_new, made a distance again around it. The surface moves by α times the distance, so
 //! a feathered region leaves a slope from where it begins to where it is full.
 

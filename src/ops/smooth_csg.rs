@@ -239,8 +239,8 @@ fn repaired(plain: &LevelSet, changes: Vec<Change>, run: &RunOptions) -> Result<
     });
     let blended = LevelSet::new(grid, transform);
 
-    // Whatever has its nearest surface among the changed voxels, before or after, is within the band of them.
-    let reach = (f64::from(half_width) + 2.0).ceil() as i32;
+    // Whatever has its nearest surface among the changed voxels, before or after, is within the band of them: within so many steps from face to face.
+    let reach = ((f64::from(half_width) + 2.0).ceil() * 3f64.sqrt()).ceil() as i32;
     let changed: FxHashSet<IVec3> =
         changes.iter().flat_map(|c| boxes(c.origin - reach, c.origin + LEAF_DIM - 1 + reach)).collect();
     let wanted = |first: IVec3, last: IVec3| boxes(first, last).any(|place| changed.contains(&place));
@@ -252,7 +252,7 @@ fn repaired(plain: &LevelSet, changes: Vec<Change>, run: &RunOptions) -> Result<
     add_missing(&mut grid, rebuilt.keys().copied());
     let seeds: FxHashMap<IVec3, LeafMask> = changes.iter().map(|change| (change.origin, change.mask)).collect();
     let seeds = VoxelSet::new(&grid, |id| seeds.get(&grid.origin(id)).copied().unwrap_or_default());
-    let affected = seeds.grown(&grid, (f64::from(reach) * 3f64.sqrt()).ceil() as usize);
+    let affected = seeds.grown(&grid, reach as usize);
     let origins: FxHashMap<LeafId, IVec3> = affected.leaves().iter().map(|id| (id, grid.origin(id))).collect();
     grid.update(affected.leaves(), |id, values, mask| {
         let new = origins.get(&id).and_then(|origin| rebuilt.get(origin));

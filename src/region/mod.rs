@@ -19,7 +19,7 @@ pub use near::Near;
 pub use plan::RegionPlan;
 pub use primitive::{HalfSpace, Primitive, Shape};
 pub use voxels::VoxelSet;
-pub use weights::RegionWeights;
+pub use weights::{RegionWeights, touched_leaves};
 
 /// A weight in space.
 pub trait Region: Send + Sync {

@@ -9,6 +9,7 @@ use crate::error::{EditError, Result};
 /// The neighbourhood of a set of points, such as an intersection curve.
 pub struct Near {
     tree: ImmutableKdTree<f64, 3>,
+    points: Vec<DVec3>,
     bounds: (DVec3, DVec3),
     reach: [f64; 2],
 }
@@ -30,25 +31,57 @@ impl Near {
             let accepted = format!("fewer points, or less dense ones: {e}");
             EditError::parameter("region", "points", points.len(), accepted)
         })?;
-        Ok(Self { tree, bounds: (lo - reach[1], hi + reach[1]), reach })
+        Ok(Self { tree, points: points.to_vec(), bounds: (lo - reach[1], hi + reach[1]), reach })
     }
 
-    /// Distance to the closest point, infinite without points.
-    fn distance(&self, xyz: DVec3) -> f64 {
+    /// Distance to the closest point, infinite without points; and the place of that.
+    fn closest(&self, xyz: DVec3) -> (f64, usize) {
         if self.tree.size() == 0 {
-            return f64::INFINITY;
+            return (f64::INFINITY, 0);
         }
-        self.tree.query(&xyz.to_array()).nearest_one::<SquaredEuclidean<f64>>().execute().distance.sqrt()
+        let found = self.tree.query(&xyz.to_array()).nearest_one::<SquaredEuclidean<f64>>().execute();
+        (found.distance.sqrt(), found.item as usize)
+    }
+
+    /// α at a distance.
+    fn at(&self, distance: f64) -> f32 {
+        (1.0 - ramp_between(distance, self.reach[0], self.reach[1])) as f32
+    }
+
+    fn is_outside(&self, xyz: DVec3) -> bool {
+        let (lo, hi) = self.bounds;
+        xyz.cmplt(lo).any() || xyz.cmpgt(hi).any()
     }
 }
 
+/// What is this much nearer than a limit, as a part of it, is so however distances are rounded.
+const SURELY: f64 = 1e-9;
+
 impl Region for Near {
     fn weight(&self, xyz: DVec3) -> f32 {
-        let (lo, hi) = self.bounds;
-        if xyz.cmplt(lo).any() || xyz.cmpgt(hi).any() {
-            return 0.0;
+        if self.is_outside(xyz) { 0.0 } else { self.at(self.closest(xyz).0) }
+    }
+
+    fn weights(&self, xyz: &[DVec3], alpha: &mut [f32]) {
+        // Between the limits alone does the distance matter. Most positions are within the lower limit of the point that was closest to the
+        // one before, or farther than the upper one from any, as their distance to that position says.
+        let (full, none) = (self.reach[0] * (1.0 - SURELY), self.reach[1] * (1.0 + SURELY));
+        let mut last: Option<(DVec3, f64, DVec3)> = None;
+        for (alpha, &xyz) in alpha.iter_mut().zip(xyz) {
+            let known = last.and_then(|(position, distance, point)| {
+                let far = distance - xyz.distance(position) > none;
+                if xyz.distance(point) < full { Some(1.0) } else { far.then_some(0.0) }
+            });
+            *alpha = match known {
+                Some(known) => known,
+                None if self.is_outside(xyz) => 0.0,
+                None => {
+                    let (distance, place) = self.closest(xyz);
+                    last = self.points.get(place).map(|point| (xyz, distance, *point));
+                    self.at(distance)
+                }
+            };
         }
-        (1.0 - ramp_between(self.distance(xyz), self.reach[0], self.reach[1])) as f32
     }
 
     fn bounds(&self) -> Option<(DVec3, DVec3)> {
@@ -56,9 +89,8 @@ impl Region for Near {
     }
 
     fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
-        let distance = self.distance(centre);
-        let [low, high] = self.reach;
-        [radius, -radius].map(|by| (1.0 - ramp_between(distance + by * (1.0 + 1e-9), low, high)) as f32)
+        let distance = self.closest(centre).0;
+        [radius, -radius].map(|by| self.at(distance + by * (1.0 + SURELY)))
     }
 }
 
@@ -77,6 +109,25 @@ mod tests {
         assert_eq!(Near::new(&[], [7.0, 9.0]).unwrap().weight(DVec3::ZERO), 0.0);
         assert!(Near::new(&[DVec3::ZERO], [9.0, 7.0]).is_err());
         assert!(Near::new(&[DVec3::NAN], [7.0, 9.0]).is_err());
+    }
+
+    #[test]
+    fn many_positions_at_once_have_the_weights_of_each() {
+        let points: Vec<DVec3> =
+            (0..60).map(|i| DVec3::new(f64::from(i) * 0.7, f64::from(i * i % 7) * 0.3, 0.0)).collect();
+        // A ramp, and a step.
+        for reach in [[7.0, 9.0], [8.0, 8.0], [0.0, 3.0]] {
+            let region = Near::new(&points, reach).unwrap();
+            let positions: Vec<DVec3> = (0..16 * 24 * 24)
+                .map(|n| DVec3::new(f64::from(n / 576), f64::from(n / 24 % 24 - 12), f64::from(n % 24 - 12)))
+                .collect();
+            let mut alpha = vec![0.5; positions.len()];
+            region.weights(&positions, &mut alpha);
+            let each: Vec<f32> = positions.iter().map(|p| region.weight(*p)).collect();
+            assert!(alpha.iter().zip(&each).all(|(a, b)| a.to_bits() == b.to_bits()));
+            let count = |of: fn(f32) -> bool| each.iter().filter(|a| of(**a)).count();
+            assert!(count(|a| a == 0.0) > 500 && count(|a| a > 0.0) > 200, "{reach:?}");
+        }
     }
 
     #[test]

@@ -55,15 +55,7 @@ impl RegionWeights {
             known: Paged::default(),
             leaves: LeafSet::default(),
         };
-        // In index space a leaf is beside a box at a glance.
-        let bounds = region.bounds().map(|bounds| transform.box_to_index(bounds));
-        let near = |id| {
-            let origin = grid.origin(id).as_dvec3();
-            bounds.is_none_or(|(lo, hi)| (origin + f64::from(LEAF_DIM)).cmpge(lo).all() && origin.cmple(hi).all())
-        };
-        let touched = |id: &LeafId| near(*id) && range(grid, transform, region, *id)[1] > 0.0;
-        let touched: Vec<_> = grid.leaves().par_iter().copied().filter(touched).collect();
-        weights.evaluate(grid, transform, region, &touched.into_iter().collect());
+        weights.evaluate(grid, transform, region, &touched_leaves(grid, transform, region));
         weights
     }
 
@@ -179,6 +171,19 @@ impl RegionWeights {
     pub fn positive(&self, id: LeafId) -> LeafMask {
         *self.positive.get(id)
     }
+}
+
+/// The leaves of `grid` that `region` may touch.
+pub fn touched_leaves(grid: &Grid, transform: &Transform, region: &dyn Region) -> LeafSet {
+    // In index space a leaf is beside a box at a glance.
+    let bounds = region.bounds().map(|bounds| transform.box_to_index(bounds));
+    let near = |id| {
+        let origin = grid.origin(id).as_dvec3();
+        bounds.is_none_or(|(lo, hi)| (origin + f64::from(LEAF_DIM)).cmpge(lo).all() && origin.cmple(hi).all())
+    };
+    let touched = |id: &LeafId| near(*id) && range(grid, transform, region, *id)[1] > 0.0;
+    let touched: Vec<_> = grid.leaves().par_iter().copied().filter(touched).collect();
+    touched.into_iter().collect()
 }
 
 /// α at the voxels `new` of a leaf. As vector work because bits are found one by one otherwise.

@@ -92,7 +92,8 @@ pub struct Emboss {
     pub height: Option<WorldLength>,
     /// Cosines of the angle between the normal and the direction to the target between which the surface begins to be drawn.
     pub angle_limits: [f64; 2],
-    /// Distance from the target within which all of the surface that does not face away is drawn; 0 for the angles alone, with which a single point is not reached.
+    /// Distance from the target within which all of the surface that does not face away is drawn, and more for a target that is farther off; 0 for the angles
+    /// alone, with which a single point is not reached.
     pub tip: VoxelLength,
     /// Push the surface away from the target instead, for `time`, `iterations` or down to `max_depth`.
     pub repel: bool,
@@ -453,7 +454,7 @@ impl Emboss {
         let nothing = |level_set: &LevelSet| {
             let voxels = level_set.grid().active_voxels();
             let flow = Report { steps: 0, time: 0.0, voxels, stopped: StopReason::AtRest };
-            AttractionReport { flow, gap: 0.0, stalled: false, moved: Default::default() }
+            AttractionReport { flow, gap: 0.0, stalled: false, moved: Default::default(), specks: 0 }
         };
         let Some(pull) = Pull::new(level_set, target, how, region, run)? else { return Ok(nothing(level_set)) };
         let Some(within) = pull.drawn_within(level_set, run)? else { return Ok(nothing(level_set)) };
@@ -482,6 +483,9 @@ impl Emboss {
                 "nothing is drawn: the target is on the surface already, or no part of the surface (in the region) faces it; nothing was changed".into(),
             );
             return;
+        }
+        if report.specks > 0 {
+            summary.warnings.push(format!("{} specks that broke off were taken away", report.specks));
         }
         if self.repel {
             return;

@@ -1,13 +1,15 @@
 //! The motion by that force: speeds of the voxels beside the surface, steps, rest.
 
+use std::collections::BTreeMap;
+
 use fearless_simd::{Simd, SimdBase};
-use glam::IVec3;
+use glam::{DVec3, IVec3};
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::super::Tracker;
 use super::super::curvature_flow::upwind_gradient;
 use super::super::evolve::{Motion, Report};
-use super::pull::Pull;
+use super::pull::{Aims, Pull};
 use super::{AttractionReport, IndexBounds, OPERATION, REACHED, leaves_around};
 use crate::error::Result;
 use crate::grid::{
@@ -33,19 +35,29 @@ const LONGEST_TIMED: f64 = 0.05;
 const LONGEST_STEP: f64 = 0.5;
 
 /// Voxels within so many voxels of the surface are asked what they feel; those beyond take it from the voxel next to their foot point, which is one.
-const FELT: f64 = 1.5;
+const FELT: f64 = 1.2;
 
 /// Voxels nearer to the surface than this keep the values of a step, in voxels.
 const NEXT: f32 = 0.75;
 
-/// Voxels with less of the pull do not tell whether all that draws is reached: the rim of a region would never be.
-const DRAWN: f32 = 0.5;
+/// Voxels with less weight do not tell whether all that draws is reached: the rim of a region would never be.
+const DRAWN: f64 = 0.5;
+
+/// Voxels of which less is drawn do not, either: they hardly face what draws. The tip of a cone between the voxels may show them its flanks alone.
+const FACING: f64 = 0.05;
 
 /// Steps without progress after which a flow is at rest.
 const PATIENCE: u32 = 8;
 
-/// What counts as progress, in voxels: a fall of the largest gap, or of the mean distance of what is drawn from its targets.
+/// What counts as progress, in voxels: a fall of the largest gap, or of the mean or least distance of what is drawn from its targets.
 const PROGRESS: f64 = 0.01;
+
+/// Distance from the surface, in voxels, up to which a target is next to it.
+const BESIDE: f64 = 2.0;
+
+/// How much a finished surface may miss what was reached, and how far beyond targets are aimed at, in voxels.
+const CLOSE_ENOUGH: f64 = 0.6 * REACHED;
+const FARTHEST_AIM: f64 = 1.5;
 
 /// A number a voxel of leaves, by the leaves' index; none where nothing is drawn.
 type Speeds = FxHashMap<usize, Box<LeafValues>>;
@@ -60,14 +72,26 @@ struct LeafFelt {
     /// Sum over the voxels that are drawn, of what they have still to go if they are pushed, and their number.
     distance: f64,
     count: f64,
+    /// Least distance from a target that is not reached.
+    nearest: Option<f64>,
+    /// The targets that are next to the surface.
+    touched: Vec<Touched>,
 }
 
-/// What all voxels feel: the largest of each, the mean distance.
+/// A target next to the surface, and the way to it.
+#[derive(Clone, Copy)]
+struct Touched {
+    point: DVec3,
+    towards: DVec3,
+}
+
+/// What all voxels feel: the largest of each, the mean and the least distance.
 struct Felts {
     fastest: f64,
     travel: f64,
     gap: f64,
     distance: f64,
+    nearest: f64,
 }
 
 /// The motion towards the target.
@@ -87,13 +111,16 @@ pub(super) struct Drawing<'a> {
     /// Origins of leaves, and the voxels of the band in them that have moved.
     moved: FxHashMap<IVec3, LeafMask>,
     gap: f64,
-    /// Largest gap and mean distance from the targets at the last progress, and the steps left to make some.
-    least: [f64; 2],
+    /// Largest gap, mean and least distance from the targets at the last progress, and the steps left to make some.
+    least: [f64; 3],
     patience: u32,
     /// Longest Euler step.
     substep: f64,
     /// The field after the last step, before it was tracked.
     stepped: Option<Grid>,
+    /// The targets that were next to the surface in the last step, by voxel.
+    touched: BTreeMap<[i32; 3], Touched>,
+    aims: Aims,
 }
 
 impl<'a> Drawing<'a> {
@@ -109,16 +136,36 @@ impl<'a> Drawing<'a> {
             leaves: FxHashSet::default(),
             moved: FxHashMap::default(),
             gap: 0.0,
-            least: [f64::INFINITY; 2],
+            least: [f64::INFINITY; 3],
             patience: PATIENCE,
             substep: f64::INFINITY,
             stepped: None,
+            touched: BTreeMap::new(),
+            aims: Aims::default(),
         }
     }
 
+    /// Aims beyond the targets that a finished surface misses, by as much as it misses them; whether it misses any by more than it may.
+    /// The tip of a cone and the rim of a fin lose up to half a voxel when they become polygons.
+    pub fn aim_beyond(&mut self, finished: &LevelSet) -> bool {
+        let (mut sampler, mut start, mut missed) = (finished.sampler(), self.start.sampler(), false);
+        for (voxel, touched) in &self.touched {
+            let side = f64::from(start.trilinear(touched.point)).signum();
+            let short = side * f64::from(sampler.trilinear(touched.point)) / finished.voxel_size();
+            let Some(towards) = touched.towards.try_normalize() else { continue };
+            let aim = self.aims.entry(IVec3::from_array(*voxel)).or_default();
+            *aim = (*aim + towards * (side * short)).clamp_length_max(FARTHEST_AIM);
+            missed |= short.abs() > CLOSE_ENOUGH;
+        }
+        if missed {
+            (self.least, self.patience) = ([f64::INFINITY; 3], PATIENCE);
+        }
+        missed
+    }
+
     /// What there is to say after a flow.
-    pub fn report(self, flow: Report) -> AttractionReport {
-        AttractionReport { flow, gap: self.gap, stalled: self.patience == 0, moved: self.leaves }
+    pub fn report(self, flow: Report, specks: u64) -> AttractionReport {
+        AttractionReport { flow, gap: self.gap, stalled: self.patience == 0, moved: self.leaves, specks }
     }
 
     /// What the voxels beside the surface feel.
@@ -146,10 +193,11 @@ impl<'a> Drawing<'a> {
             if alpha <= 0.0 {
                 continue;
             }
-            let Some(voxel) = self.pull.at(&mut sampler, self.original.as_ref(), voxel_size, ijk, near) else {
+            let Some(voxel) = self.pull.at(&mut sampler, self.original.as_ref(), voxel_size, ijk, near, &self.aims)
+            else {
                 continue;
             };
-            near = Some(voxel.point);
+            near = Some(voxel.target);
             // What is about to be drawn limits the step as well.
             felt.travel = felt.travel.max(voxel.travel * alpha);
             let speed = voxel.speed * alpha;
@@ -158,8 +206,14 @@ impl<'a> Drawing<'a> {
             }
             felt.speeds.get_or_insert_default().0[offset] = speed as f32;
             felt.fastest = felt.fastest.max(speed.abs());
-            if voxel.share * alpha >= f64::from(DRAWN) {
+            if alpha >= DRAWN && voxel.share >= FACING {
                 felt.gap = felt.gap.max(voxel.gap);
+                if voxel.gap >= CLOSED {
+                    felt.nearest = Some(felt.nearest.map_or(voxel.distance, |nearest| nearest.min(voxel.distance)));
+                }
+                if voxel.distance < BESIDE {
+                    felt.touched.push(Touched { point: voxel.target.point, towards: voxel.towards });
+                }
                 felt.distance += if self.pull.how.repel { voxel.gap } else { voxel.distance };
                 felt.count += 1.0;
             }
@@ -222,10 +276,16 @@ impl<'a> Drawing<'a> {
             travel: most(|f| f.travel),
             gap: most(|f| f.gap),
             distance: felt.iter().map(|f| f.distance).sum::<f64>() / count.max(1.0),
+            nearest: felt.iter().filter_map(|f| f.nearest).fold(f64::INFINITY, f64::min),
         };
         let by_leaf = |speeds: Vec<Option<Box<LeafValues>>>| -> Speeds {
             grid.leaves().iter().zip(speeds).filter_map(|(id, speeds)| Some((id.index(), speeds?))).collect()
         };
+        self.touched.clear();
+        for touched in felt.iter().flat_map(|felt| &felt.touched) {
+            let place = self.touched.entry(touched.point.round().as_ivec3().to_array());
+            place.and_modify(|known| known.towards += touched.towards).or_insert(*touched);
+        }
         let speeds = by_leaf(felt.into_iter().map(|felt| felt.speeds).collect());
         let drawn = grid.leaves().iter().filter(|id| speeds.contains_key(&id.index()));
         let drawn: Vec<IVec3> = drawn.map(|id| grid.origin(*id)).collect();
@@ -256,7 +316,7 @@ impl Motion for Drawing<'_> {
         if felts.fastest == 0.0 || (!endless && self.gap < CLOSED) {
             return None;
         }
-        for (least, now) in self.least.iter_mut().zip([felts.gap, felts.distance]) {
+        for (least, now) in self.least.iter_mut().zip([felts.gap, felts.distance, felts.nearest]) {
             if now < *least - PROGRESS {
                 (*least, self.patience) = (now, PATIENCE);
             }

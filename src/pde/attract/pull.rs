@@ -1,7 +1,10 @@
 //! The force on a surface: what a voxel feels of the target.
 
+use std::sync::RwLock;
+
 use glam::{DVec3, IVec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rustc_hash::FxHashMap;
 
 use super::{Attraction, Attractor, IndexBounds, OPERATION, REACHED};
 use crate::error::{EditError, Result};
@@ -17,11 +20,16 @@ const WINDOW: f64 = 0.05;
 const UPWIND: f64 = 0.25;
 const ASKEW: f64 = 0.1;
 
-/// The cosine from which on a surface within the tip is drawn fully.
-const SIDEWAYS: f64 = 0.5;
+/// The cosines between which what is drawn within the tip rises from nothing to all. The flanks of a straight cone have 0: they must
+/// widen while the tip grows, or it becomes thinner than the voxels show.
+const SIDEWAYS: [f64; 2] = [-0.4, 0.1];
 
 /// The closest surface point of a target is told by the foot points of voxels, which are no farther from it than this, in voxels.
 const FOOTING: f64 = 0.5;
+
+/// A target this part of its distance from the surface at the start away draws like one within `tip`: what is drawn has the same shape from far as from near,
+/// of as many voxels more. A single point six voxels off is reached with the least tip.
+const FAR_TIP: f64 = Attraction::TIP / 6.0;
 
 /// Voxels around what is drawn and what draws it that may change as well.
 const MARGIN: f64 = 6.0;
@@ -38,17 +46,68 @@ pub(super) struct Felt {
     pub gap: f64,
     /// From the surface to the target, in voxels.
     pub distance: f64,
-    /// The target.
-    pub point: DVec3,
+    /// What draws.
+    pub target: Target,
+    /// From the surface to what draws, or away from it for a target inside: a unit vector.
+    pub towards: DVec3,
 }
+
+/// A point of the target.
+#[derive(Clone, Copy)]
+pub(super) struct Target {
+    pub point: DVec3,
+    /// Distance from the surface as it was, in voxels, once it has been asked for.
+    nearest: Option<f64>,
+}
+
+/// Places a little beyond points of the target, by voxel: what to aim at instead.
+pub(super) type Aims = FxHashMap<IVec3, DVec3>;
 
 /// The force on a surface.
 pub struct Pull<'a> {
     target: &'a dyn Attractor,
     pub(super) how: &'a Attraction,
     pub(super) region: Option<&'a dyn Region>,
-    /// Points of the surface as it was, where the region lets it move.
-    before: ImmutableKdTree<f64, 3>,
+    before: Before,
+}
+
+/// The surface as it was, where the region lets it move.
+struct Before {
+    points: ImmutableKdTree<f64, 3>,
+    /// Distances of voxels from it, as far as they have been asked for: a point far off has many that are almost the closest, and is asked for again in every
+    /// step.
+    known: RwLock<FxHashMap<IVec3, f64>>,
+}
+
+/// Distances of voxels that are kept.
+const MOST_KNOWN: usize = 1 << 22;
+
+impl Before {
+    /// Distance of a point, linear between those of the voxels around it.
+    fn distance(&self, point: DVec3) -> f64 {
+        let first = point.floor();
+        let part = point - first;
+        let weight = |c: i32, axis: usize| if c == 1 { part[axis] } else { 1.0 - part[axis] };
+        let corner = |n: i32| {
+            let [x, y, z] = [n >> 2, n >> 1 & 1, n & 1];
+            weight(x, 0) * weight(y, 1) * weight(z, 2) * self.of_voxel(first.as_ivec3() + IVec3::new(x, y, z))
+        };
+        (0..8).map(corner).sum()
+    }
+
+    fn of_voxel(&self, ijk: IVec3) -> f64 {
+        if let Some(distance) = self.known.read().ok().and_then(|known| known.get(&ijk).copied()) {
+            return distance;
+        }
+        let place = ijk.as_dvec3().to_array();
+        let distance = self.points.query(&place).nearest_one::<SquaredEuclidean<f64>>().execute().distance.sqrt();
+        if let Ok(mut known) = self.known.write()
+            && known.len() < MOST_KNOWN
+        {
+            known.insert(ijk, distance);
+        }
+        distance
+    }
 }
 
 impl<'a> Pull<'a> {
@@ -67,7 +126,7 @@ impl<'a> Pull<'a> {
         if feet.is_empty() {
             return Ok(None);
         }
-        let before = ImmutableKdTree::new_from_slice(&feet).map_err(|e| {
+        let points = ImmutableKdTree::new_from_slice(&feet).map_err(|e| {
             EditError::parameter(
                 OPERATION,
                 "region",
@@ -75,6 +134,7 @@ impl<'a> Pull<'a> {
                 format!("a smaller part of the surface: {e}"),
             )
         })?;
+        let before = Before { points, known: RwLock::default() };
         Ok(Some(Self { target, how, region, before }))
     }
 
@@ -83,10 +143,11 @@ impl<'a> Pull<'a> {
         let voxel_size = level_set.voxel_size();
         let boxes = beside_surface(level_set, self.region, run, |drawn: &mut Drawn, sampler, ijk| {
             // At the start nothing has been pushed: no depth counts yet.
-            let Some(felt) = self.at(sampler, None, voxel_size, ijk, drawn.near) else { return };
-            drawn.near = Some(felt.point);
+            let Some(felt) = self.at(sampler, None, voxel_size, ijk, drawn.near, &Aims::default()) else { return };
+            drawn.near = Some(felt.target);
             if felt.share > 0.0 && (self.how.repel || felt.gap >= REACHED) {
-                let (a, b) = (ijk.as_dvec3().min(felt.point), ijk.as_dvec3().max(felt.point));
+                let point = felt.target.point;
+                let (a, b) = (ijk.as_dvec3().min(point), ijk.as_dvec3().max(point));
                 drawn.bounds = Some(drawn.bounds.map_or((a, b), |(lo, hi)| (lo.min(a), hi.max(b))));
             }
         })?;
@@ -94,17 +155,18 @@ impl<'a> Pull<'a> {
         Ok(bounds.map(|(lo, hi)| (lo - MARGIN, hi + MARGIN)))
     }
 
-    /// Part of what faces a target at `distance` that is near enough to it, if the surface is now `gap` away from it.
-    fn reach(&self, point: DVec3, distance: f64, gap: f64) -> f64 {
+    /// Part of what faces a target at `distance` that is near enough to it, if the surface was `nearest` away from it.
+    fn reach(&self, distance: f64, nearest: f64) -> f64 {
         // Feet of voxels stand for the surface between them.
-        let weight = |nearest: f64| self.how.cut_off.weight((nearest + FOOTING) / distance.max(FOOTING));
-        // What is drawn has come nearer since the start. What is pushed goes away: its distance says nothing.
-        if self.how.repel || weight(gap) >= 1.0 {
-            return 1.0;
-        }
-        let nearest =
-            self.before.query(&point.to_array()).nearest_one::<SquaredEuclidean<f64>>().execute().distance.sqrt();
-        weight(nearest)
+        self.how.cut_off.weight((nearest + FOOTING) / distance.max(FOOTING))
+    }
+
+    /// The target closest to a surface point, which is no farther than `near`.
+    fn target(&self, foot: DVec3, near: Option<Target>) -> Option<Target> {
+        // Wide enough for the rounding of a point that is found again.
+        let within = near.map_or(f64::INFINITY, |near| near.point.distance(foot) * (1.0 + 1e-9) + 1e-9);
+        let point = self.target.closest(foot, within)?;
+        Some(near.filter(|near| near.point == point).unwrap_or(Target { point, nearest: None }))
     }
 
     /// What the voxel at `ijk` feels; `None` where the field has no normal, or without a target. `near` is a point of the target, the nearer the
@@ -115,23 +177,32 @@ impl<'a> Pull<'a> {
         original: Option<&LevelSet>,
         voxel_size: f64,
         ijk: IVec3,
-        near: Option<DVec3>,
+        near: Option<Target>,
+        aims: &Aims,
     ) -> Option<Felt> {
         let (foot, normal) = foot(sampler, voxel_size, ijk)?;
-        // Wide enough for the rounding of a point that is found again.
-        let within = near.map_or(f64::INFINITY, |near| near.distance(foot) * (1.0 + 1e-9) + 1e-9);
-        let point = self.target.closest(foot, within)?;
+        let mut target = self.target(foot, near)?;
+        let point = target.point + aims.get(&target.point.round().as_ivec3()).copied().unwrap_or_default();
         let (to, phi) = (point - foot, f64::from(sampler.trilinear(point)));
         let distance = to.length();
         let towards = if distance > 1e-6 { to / distance * phi.signum() } else { normal };
-        let tip = self.how.tip;
+        let mut tip = self.how.tip;
+        // What is pushed goes away: distances from where it was say nothing of it.
+        let nearest = if self.how.repel || distance <= tip / 2.0 {
+            f64::INFINITY
+        } else {
+            let nearest = *target.nearest.get_or_insert_with(|| self.before.distance(target.point));
+            tip = if tip > 0.0 { tip.max(FAR_TIP * nearest) } else { 0.0 };
+            nearest
+        };
         let close = if tip > 0.0 { 1.0 - ramp_between(distance, tip / 2.0, tip) } else { 0.0 };
         let mut cosine = normal.dot(towards);
         let mut gap = phi.abs() / voxel_size;
         let faces = self.how.cut_off.weight(cosine + WINDOW) > 0.0;
-        let reach = if faces && close < 1.0 { self.reach(point, distance, gap) } else { 1.0 };
-        let share =
-            |cosine: f64| (reach * self.how.cut_off.weight(cosine)).max(close * ramp_between(cosine, 0.0, SIDEWAYS));
+        let reach = if faces && close < 1.0 { self.reach(distance, nearest) } else { 1.0 };
+        let share = |cosine: f64| {
+            (reach * self.how.cut_off.weight(cosine)).max(close * ramp_between(cosine, SIDEWAYS[0], SIDEWAYS[1]))
+        };
         let slope = (share(cosine + WINDOW) - share(cosine - WINDOW)) / (2.0 * WINDOW);
         let aside = towards - normal * cosine;
         let travel = slope * gap * aside.length();
@@ -157,7 +228,7 @@ impl<'a> Pull<'a> {
                 share = 0.0;
             }
         }
-        Some(Felt { speed: share * speed, share, travel, gap, distance, point })
+        Some(Felt { speed: share * speed, share, travel, gap, distance, target, towards })
     }
 }
 
@@ -181,7 +252,7 @@ fn foot(sampler: &mut Sampler, voxel_size: f64, ijk: IVec3) -> Option<(DVec3, DV
 struct Drawn {
     bounds: Option<IndexBounds>,
     /// The target of the voxel before.
-    near: Option<DVec3>,
+    near: Option<Target>,
 }
 
 /// What `f` gathers, leaf by leaf, of the voxels beside the surface that `region` lets move; these stand for the others on their normals.

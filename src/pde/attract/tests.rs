@@ -94,7 +94,7 @@ fn a_point_draws_what_faces_it() {
     let mut sampler = level_set.sampler();
     for (r, expected) in (0..6).zip([6.0, 6.0, 6.0, 5.963, 1.233, 0.0]) {
         for z in [-2, 0, 1, 3] {
-            let felt = pull.at(&mut sampler, None, 1.0, IVec3::new(r, 0, z), None).unwrap();
+            let felt = pull.at(&mut sampler, None, 1.0, IVec3::new(r, 0, z), None, &Default::default()).unwrap();
             assert!((felt.speed - expected).abs() < 1e-3, "{r} {z} {}", felt.speed);
         }
     }
@@ -115,6 +115,48 @@ fn a_single_point_is_reached() {
     for (r, z) in [(4.0, 5.0), (4.0, 6.0), (5.0, 3.0)] {
         assert!(sampler.trilinear(DVec3::new(r, 0.0, z)) > 0.0, "{r} {z}");
     }
+}
+
+#[test]
+fn points_between_the_voxels_and_far_off_are_reached() {
+    for point in [[0.5, 0.5, 6.0], [0.37, 0.21, 8.4], [0.5, 0.5, 15.7], [0.37, 0.21, -8.4]] {
+        let point = DVec3::from_array(point);
+        let (level_set, report) = drawn(&points([point]), &Attraction::default(), Until::Rest(1000));
+        let gap = level_set.sampler().trilinear(point);
+        assert!(f64::from(gap).abs() < REACHED, "{point}: {gap} {report:?}");
+        assert_eq!(level_set.measure(&RunOptions::default()).unwrap().components, 1);
+    }
+}
+
+#[test]
+fn a_ring_draws_a_whole_wall() {
+    let at = |i: u32| {
+        let angle = f64::from(i) / 60.0 * std::f64::consts::TAU;
+        DVec3::new(15.0 * angle.cos() + 0.3, 15.0 * angle.sin() + 0.1, 12.0)
+    };
+    let (level_set, report) = drawn(&points((0..60).map(at)), &Attraction::default(), Until::Rest(1000));
+    let mut sampler = level_set.sampler();
+    for point in (0..60).map(at) {
+        let gap = f64::from(sampler.trilinear(point));
+        assert!(gap.abs() < REACHED, "{point}: {gap} {report:?}");
+    }
+    let measured = level_set.measure(&RunOptions::default()).unwrap();
+    assert_eq!((measured.components, measured.euler), (1, 2));
+}
+
+#[test]
+fn what_breaks_off_is_taken_away() {
+    let (before, run) = (ground(), RunOptions::default());
+    let half = DVec3::new(30.0, 30.0, 15.0);
+    let both = |p: DVec3| {
+        box_distance(p + DVec3::Z * half.z, half).min(box_distance(p - DVec3::new(0.0, 0.0, 6.2), DVec3::splat(1.6)))
+    };
+    let bounds = (IVec3::new(-40, -40, -40), IVec3::new(40, 40, 18));
+    let both = LevelSet::from_distance(Transform::uniform(1.0), 7.0, bounds, both, &run).unwrap();
+    let (left, specks) = without_specks(&both, &before, &run).unwrap();
+    let rebuilt = |level_set: &LevelSet| rebuild(level_set, &Rebuild::band(3.0), &run).unwrap().measure(&run).unwrap();
+    assert_eq!((specks, rebuilt(&left).components), (1, 1));
+    assert_eq!(rebuilt(&left).volume, rebuilt(&before).volume);
 }
 
 #[test]
