@@ -3,13 +3,14 @@
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
+use super::field::Field;
 use super::level::Level;
 use super::patch::{Net, patch};
-use crate::levelset::LevelSet;
 use crate::mesh::{Spline, double_reflection};
 
-/// Largest step of a particle, in voxels.
+/// Largest step of a particle, in voxels of the lattice that it is in, and the height up to which that is the base's.
 const STEP: f64 = 0.5;
+const NEAR: f64 = 3.0;
 
 /// Most layers above the surface.
 const MOST_LAYERS: usize = 48;
@@ -100,7 +101,7 @@ fn even(height: f64, spacing: f64) -> Vec<f64> {
 impl Volume {
     /// Over `base`, on the levels of the field: each particle follows ∇φ. The band must reach two voxels beyond the levels. Particles keep
     /// their neighbours at every height, so cells widen over convex parts and narrow over concave ones.
-    pub fn conforming(field: &LevelSet, base: Net, heights: &Heights) -> Self {
+    pub fn conforming(field: &Field, base: Net, heights: &Heights) -> Self {
         let nets = |levels: &[f64]| {
             let climbed = |p: &DVec3| climb(field, *p, levels, None);
             let paths: Vec<Vec<DVec3>> = base.points.par_iter().map(climbed).collect();
@@ -114,7 +115,7 @@ impl Volume {
     /// As [`conforming`](Self::conforming), but only the corners climb, along `directions` if there are any; between them each level gets a
     /// net of its own, so that cells stay even. `None` where a level cannot be spanned.
     pub fn low_distortion(
-        field: &LevelSet,
+        field: &Field,
         base: Net,
         heights: &Heights,
         spacing: f64,
@@ -138,7 +139,7 @@ impl Volume {
     /// by frames that turn as little as can be, and drawn together where the curve bends so much that they would meet. w is the part of the curve's
     /// length. A layer `depth` under the base follows the field. Returns the length of the curve as well.
     pub fn along_spline(
-        field: &LevelSet,
+        field: &Field,
         base: Net,
         points: &[DVec3],
         normal: DVec3,
@@ -235,7 +236,7 @@ fn drawn_together(allowed: &[f64], lengths: &[f64], reach: f64) -> Vec<f64> {
 }
 
 /// The places of a particle of the surface on levels that begin at 0 and rise, or fall, along ∇φ or a direction. It stays where the field has no slope.
-fn climb(field: &LevelSet, from: DVec3, levels: &[f64], direction: Option<DVec3>) -> Vec<DVec3> {
+fn climb(field: &Field, from: DVec3, levels: &[f64], direction: Option<DVec3>) -> Vec<DVec3> {
     let mut probe = Level::new(field, 0.0).probe();
     // dx/dc for the level c: unit speed through the levels.
     let mut velocity = |x: DVec3| {
@@ -250,9 +251,10 @@ fn climb(field: &LevelSet, from: DVec3, levels: &[f64], direction: Option<DVec3>
     };
     let mut settle = Level::new(field, 0.0).probe();
     let mut path = Vec::with_capacity(levels.len());
-    let (mut x, mut c) = (from, 0.0);
+    let (mut x, mut c) = (from, 0.0f64);
     for &end in levels {
-        let steps = (end - c).abs().div_euclid(STEP) as usize + 1;
+        let longest = if c.abs() < NEAR { STEP } else { STEP * field.coarseness() };
+        let steps = (end - c).abs().div_euclid(longest) as usize + 1;
         let step = (end - c) / steps as f64;
         for _ in 0..steps {
             c += step;
@@ -274,15 +276,17 @@ mod tests {
     use super::super::patch::corners_on_surface;
     use super::*;
     use crate::grid::Transform;
+    use crate::levelset::LevelSet;
     use crate::run::RunOptions;
 
     /// Voxel size 1.
-    fn sampled(reach: i32, half_width: f32, f: impl Fn(DVec3) -> f64 + Sync) -> LevelSet {
+    fn sampled(reach: i32, half_width: f32, f: impl Fn(DVec3) -> f64 + Sync) -> Field {
         let bounds = (IVec3::splat(-reach), IVec3::splat(reach));
-        LevelSet::from_distance(Transform::uniform(1.0), half_width, bounds, f, &RunOptions::default()).unwrap()
+        let level_set = LevelSet::from_distance(Transform::uniform(1.0), half_width, bounds, f, &RunOptions::default());
+        Field::around(&level_set.unwrap(), 8.0)
     }
 
-    fn over(field: &LevelSet, corners: [DVec3; 4]) -> Net {
+    fn over(field: &Field, corners: [DVec3; 4]) -> Net {
         let corners = corners_on_surface(field, corners, 5.0, false).unwrap();
         patch(Level::new(field, 0.0), corners, 2.0, None).unwrap()
     }

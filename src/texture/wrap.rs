@@ -134,7 +134,7 @@ pub fn wrapped(
             let implicit = Implicit::new(patch, rbf)?;
             let voxels = leaves.len() as u64 * 512;
             let (made, sums) = implicit.leaves(&solid, leaves, run)?;
-            (made, Some([sums * implicit.particles(), voxels * implicit.particles()]))
+            (made, Some([sums, voxels * implicit.particles()]))
         }
         Map::SemiImplicit | Map::Inverse => (by_inverse(&solid, patch, leaves, run)?, None),
     };
