@@ -5,7 +5,7 @@
 //! nearest of many points of the surface the tangent plane leads on to it. Between nodes they are linear, which errs by up to g²κ/8 along an
 //! axis, for a lattice of g voxels and levels of curvature κ.
 
-use glam::{DVec3, IVec3};
+use glam::DVec3;
 use rayon::prelude::*;
 
 use super::OPERATION;
@@ -18,8 +18,8 @@ use crate::run::RunOptions;
 pub(super) const ABOVE: f64 = 120e3;
 pub(super) const GROUND: f64 = 30e3;
 
-/// Edge of the blocks of voxels that get one point of the surface each, in voxels.
-const BLOCK: i32 = 2;
+/// Edge of the blocks of voxels that get one point of the surface each, in voxels, for lattices up to twice as coarse as the base's and for coarser ones.
+const BLOCK: [i32; 2] = [2, 4];
 
 /// Distances around a patch. Positions and distances are in voxels of the base.
 pub(super) struct Field {
@@ -43,7 +43,7 @@ impl Field {
         let size = counts.iter().product::<usize>();
         run.reserve(OPERATION, size as u64 * 4, "take a smaller patch or height")?;
         let (grid, h) = (base.grid(), base.voxel_size());
-        let samples = samples(base, lo - reach, hi + reach);
+        let samples = samples(base, lo - reach, hi + reach, BLOCK[usize::from(edge > 2.0)]);
         run.check(OPERATION)?;
         let mut nodes = Nodes { origin, edge, counts, samples: &samples, nearest: vec![NONE; size] };
         nodes.seed();
@@ -143,9 +143,9 @@ impl Field {
 }
 
 /// Points of the surface between `lo` and `hi`: of each block that it goes through, the one closest to the voxel that is nearest to it.
-fn samples(base: &LevelSet, lo: DVec3, hi: DVec3) -> Vec<DVec3> {
+fn samples(base: &LevelSet, lo: DVec3, hi: DVec3, block: i32) -> Vec<DVec3> {
     let (grid, h) = (base.grid(), base.voxel_size());
-    let blocks = LEAF_DIM / BLOCK;
+    let blocks = LEAF_DIM / block;
     let of_leaves = grid.map_leaves(|id| {
         let origin = grid.origin(id);
         let outside = origin.as_dvec3().cmpgt(hi).any() || (origin + LEAF_DIM).as_dvec3().cmplt(lo).any();
@@ -154,7 +154,7 @@ fn samples(base: &LevelSet, lo: DVec3, hi: DVec3) -> Vec<DVec3> {
         }
         let mut nearest = vec![(h as f32, 0); blocks.pow(3) as usize];
         for offset in grid.mask(id).iter() {
-            let at = offset_to_local(offset) / BLOCK;
+            let at = offset_to_local(offset) / block;
             let best = &mut nearest[((at.x * blocks + at.y) * blocks + at.z) as usize];
             let away = grid.values(id).0[offset].abs();
             if away < best.0 {
@@ -172,7 +172,7 @@ fn samples(base: &LevelSet, lo: DVec3, hi: DVec3) -> Vec<DVec3> {
 fn closest(p: DVec3, edge: f64, sampler: &mut Sampler, x: DVec3) -> DVec3 {
     let normal = sampler.smooth_gradient(p).normalize_or_zero();
     let aside = (x - p) - normal * (x - p).dot(normal);
-    let better = sampler.closest_point(p + aside.clamp_length_max(edge.max(f64::from(BLOCK)))).unwrap_or(p);
+    let better = sampler.closest_point(p + aside.clamp_length_max(edge.max(f64::from(BLOCK[0])))).unwrap_or(p);
     if better.distance_squared(x) < p.distance_squared(x) { better } else { p }
 }
 

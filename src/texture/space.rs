@@ -1,6 +1,7 @@
 //! A patch with the space above it.
 
 use std::fmt::Write as _;
+use std::sync::OnceLock;
 
 use glam::DVec3;
 
@@ -49,7 +50,7 @@ pub enum Parameterization {
 /// A patch of a surface with the space above it, and the map from (u, v, w) in 0..1³ into that.
 pub struct Patch {
     pub(super) volume: Volume,
-    pub(super) cells: Cells,
+    cells: OnceLock<Cells>,
     /// Lengths of the edges p1p2 and p1p4 and the height, in voxels.
     lengths: DVec3,
     /// Whether the space is outside of the surface.
@@ -101,9 +102,14 @@ impl Patch {
         Space::around(base, &net, height, parameterization, run)?.patch(net, parameterization, run)
     }
 
+    /// Made when they are first asked for: the semi-implicit map does without.
+    pub(super) fn cells(&self) -> &Cells {
+        self.cells.get_or_init(|| Cells::new(&self.volume))
+    }
+
     /// Distortion of the map from a texture of this patch's edge lengths and height.
     pub fn distortion(&self) -> Distortion {
-        self.cells.distortion(self.lengths)
+        self.cells().distortion(self.lengths)
     }
 
     /// Lengths of the edges p1p2 and p1p4 and the height, in voxels.
@@ -119,7 +125,7 @@ impl Patch {
     /// (u, v, w) of a place in voxels, the exact inverse of [`place`](Self::place); `None` outside the space above the patch. w goes on a few
     /// voxels beyond the surface.
     pub fn find(&self, ijk: DVec3) -> Option<DVec3> {
-        self.cells.finder().find(ijk)
+        self.cells().finder().find(ijk)
     }
 
     /// The particles, in voxels, with their (u, v, w), and the edges between them.
@@ -228,8 +234,7 @@ impl Space {
             }
         };
         run.check(OPERATION)?;
-        let cells = Cells::new(&volume);
-        Ok(Patch { volume, cells, lengths, raised: height > 0.0, depth })
+        Ok(Patch { volume, cells: OnceLock::new(), lengths, raised: height > 0.0, depth })
     }
 }
 

@@ -126,7 +126,7 @@ pub fn wrapped(
         return Ok(Wrapped { level_set, kernels: None });
     }
     let solid = Solid::new(texture, base, patch, laying, run)?;
-    let leaves = patch.cells.leaves();
+    let leaves = patch.cells().leaves();
     let advice = "take a smaller patch or height, or larger voxels";
     run.reserve(OPERATION, leaves.len() as u64 * BYTES_A_LEAF, advice)?;
     let (made, kernels) = match laying.map {
@@ -204,7 +204,7 @@ impl<'a> Solid<'a> {
     fn new(texture: &mut Source, base: &'a LevelSet, patch: &Patch, laying: &Laying, run: &RunOptions) -> Result<Self> {
         let (lo, size) = (texture.bounds.0, texture.size());
         let tile = laying.tile.map(|n| f64::from(n.max(1)));
-        let [typical, stretch] = patch.cells.stretch(size * DVec3::new(tile[0], tile[1], 1.0));
+        let [typical, stretch] = patch.cells().stretch(size * DVec3::new(tile[0], tile[1], 1.0));
         let texture = texture.lattice(typical, run)?;
         let height = patch.lengths().z;
         Ok(Self {
@@ -384,6 +384,7 @@ pub(super) type Leaves = Vec<(IVec3, LeafValues, LeafMask)>;
 const BLOCK: i32 = 4;
 
 fn by_inverse(solid: &Solid, patch: &Patch, leaves: Vec<IVec3>, run: &RunOptions) -> Result<Leaves> {
+    let cells = patch.cells();
     let task = run.task("wrapping", leaves.len() as u64);
     let made = leaves.into_par_iter().map_init(
         || solid.probe(),
@@ -393,7 +394,7 @@ fn by_inverse(solid: &Solid, patch: &Patch, leaves: Vec<IVec3>, run: &RunOptions
             }
             task.advance(1);
             // Anew in each leaf: what it holds must not depend on the one before.
-            let mut finder = patch.cells.finder();
+            let mut finder = cells.finder();
             let mut at = |ijk: DVec3| finder.find(ijk).map(|uvw| solid.distance(probe, ijk, uvw));
             let far = |d: f64, edge: i32| d.abs() > radius(edge) + solid.half_width();
             let middle = |edge: i32| DVec3::splat(f64::from(edge - 1) / 2.0);
