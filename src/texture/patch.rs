@@ -25,6 +25,10 @@ const COARSE_SWEEPS: usize = 500;
 const SWEEPS: usize = 60;
 const REST: f64 = 1e-3;
 
+/// Part of the cells of a patch that may fold over, and how much longer than the mean one a cell may be.
+const SLIVERS: f64 = 0.02;
+const TORN: f64 = 8.0;
+
 /// Neighbouring corners whose normals differ by more than this see opposite sides of the surface.
 const OPPOSITE: f64 = 150.0;
 
@@ -65,6 +69,27 @@ impl Net {
     pub fn edges(&self) -> [f64; 2] {
         let [bottom, _, left, _] = self.sides();
         [length(&bottom), length(&left)]
+    }
+
+    /// What is wrong with it as a piece of a surface: cells that turn away from the side that most of them face, or that are much longer than the others, as
+    /// where it is spanned across a hole.
+    pub(super) fn flaw(&self) -> Option<&'static str> {
+        let [nu, nv] = self.counts;
+        let (mut areas, mut longest) = (Vec::with_capacity(nu * nv), 0.0f64);
+        for i in 0..nu {
+            for j in 0..nv {
+                let (along, across) = (self.at(i + 1, j) - self.at(i, j), self.at(i, j + 1) - self.at(i, j));
+                longest = longest.max(along.length()).max(across.length());
+                let other = (self.at(i + 1, j + 1) - self.at(i, j + 1), self.at(i + 1, j + 1) - self.at(i + 1, j));
+                areas.push((along.cross(across), other.0.cross(other.1)));
+            }
+        }
+        // Both corners of a cell see one side, but for a few slivers in creases.
+        let turned = areas.iter().filter(|(a, b)| a.dot(*b) <= 0.0).count();
+        if turned as f64 > SLIVERS * areas.len() as f64 {
+            return Some("the patch folds over");
+        }
+        (longest > TORN * self.spacing().max(1.0)).then_some("the patch is torn, as across a hole")
     }
 
     /// Mean length of the cells along the first sides.

@@ -88,6 +88,10 @@ impl Patch {
         let ground = Field::new(base, bounds(&corners, around, "corners")?, 0.0, GROUND, run)?;
         let corners = corners_on_surface(&ground, corners, reach, handed).map_err(refuse)?;
         let net = patch(Level::new(&ground, 0.0), corners, SPACING, None).ok_or_else(|| broken(OPERATION))?;
+        if let Some(flaw) = net.flaw() {
+            let accepted = "corners on one smooth piece of the surface, without a hole or a fold between them";
+            return Err(refuse(format!("{accepted}: {flaw}")));
+        }
         Self::over(base, net, height, parameterization, run)
     }
 

@@ -17,13 +17,20 @@ const MOST_LAYERS: usize = 48;
 
 /// Most levels that get a net of their own, and most sections along a spline.
 const MOST_NETS: usize = 12;
-const MOST_SECTIONS: usize = 96;
+const MOST_SECTIONS: usize = 192;
 
 /// Pieces that a spline is cut into between two points for its length, frames and curvature.
 const PIECES: usize = 64;
 
 /// Part of the radius of curvature of a spline that its sections may reach to: at 1 particles would run backwards.
 const WITHIN_BEND: f64 = 0.9;
+
+/// Angle (radians) that a spline turns by between two sections at most, as far as their number allows.
+const TURN: f64 = 0.1;
+
+/// How often sections that fold are drawn together further, and to what part of their width each time.
+const MOST_ROUNDS: usize = 40;
+const NARROWER: f64 = 0.85;
 
 /// A direction that rises less than this with the surface is along it.
 const LEAST_SLOPE: f64 = 0.1;
@@ -148,32 +155,32 @@ impl Volume {
     ) -> (Self, f64) {
         let curve = Spline::through(points);
         // Point, tangent and length so far.
-        let (mut places, mut lengths, mut length) = (vec![curve.at(0, 0.0)], vec![0.0], 0.0);
+        let (mut curve_places, mut lengths, mut length) = (vec![curve.at(0, 0.0)], vec![0.0], 0.0);
         for i in 0..curve.pieces() {
             for k in 1..=PIECES {
                 let place = curve.at(i, k as f64 / PIECES as f64);
-                length += place.0.distance(places[places.len() - 1].0);
-                places.push(place);
+                length += place.0.distance(curve_places[curve_places.len() - 1].0);
+                curve_places.push(place);
                 lengths.push(length);
             }
         }
-        let tangent = places[0].1;
+        let tangent = curve_places[0].1;
         let across = tangent.any_orthonormal_vector();
         let first = DMat3::from_cols(across, tangent.cross(across), tangent);
         let mut frames = vec![first];
-        for w in places.windows(2) {
+        for w in curve_places.windows(2) {
             frames.push(double_reflection(&frames[frames.len() - 1], w[0], w[1]));
         }
         // The base stands across the normal, the sections across the curve.
         let upright = DMat3::from_quat(DQuat::from_rotation_arc(normal, tangent));
-        let start = places[0].0;
+        let start = curve_places[0].0;
         let local: Vec<DVec3> = base.points.iter().map(|p| first.transpose() * (upright * (*p - start))).collect();
         // κ N by differences, in each frame.
-        let n = places.len();
+        let n = curve_places.len();
         let bends: Vec<DVec3> = (0..n)
             .map(|k| {
                 let (a, b) = (k.saturating_sub(1), (k + 1).min(n - 1));
-                frames[k].transpose() * (places[b].1 - places[a].1) / (lengths[b] - lengths[a]).max(1e-12)
+                frames[k].transpose() * (curve_places[b].1 - curve_places[a].1) / (lengths[b] - lengths[a]).max(1e-12)
             })
             .collect();
         let allowed: Vec<f64> = bends
@@ -183,34 +190,45 @@ impl Volume {
                 if reach > WITHIN_BEND { WITHIN_BEND / reach } else { 1.0 }
             })
             .collect();
-        let widths =
-            drawn_together(&allowed, &lengths, local.iter().map(|p| p.truncate().length()).fold(0.0, f64::max));
-        let count = ((length / spacing).ceil() as usize).clamp(4, MOST_SECTIONS);
-        let mut sections = Vec::with_capacity(count);
-        let mut at = 0;
-        for k in 1..=count {
-            let s = length * k as f64 / count as f64;
-            while at + 2 < n && lengths[at + 1] < s {
-                at += 1;
-            }
-            let t = ((s - lengths[at]) / (lengths[at + 1] - lengths[at]).max(1e-12)).clamp(0.0, 1.0);
-            let place = |j: usize| {
-                // The base's relief fades along the curve: sections become plane.
-                let size = DVec3::new(widths[j], widths[j], (1.0 - lengths[j] / length).max(0.0));
-                let (point, frame) = (places[j].0, frames[j]);
-                local.iter().map(|p| point + frame * (*p * size)).collect::<Vec<_>>()
+        let reach = local.iter().map(|p| p.truncate().length()).fold(0.0, f64::max);
+        let places = section_places(&bends, &lengths, spacing);
+        let sections = |widths: &[f64]| -> Vec<Net> {
+            let section = |&(at, t): &(usize, f64)| {
+                let place = |j: usize| {
+                    // The base's relief fades along the curve: sections become plane.
+                    let size = DVec3::new(1.0, 1.0, (1.0 - lengths[j] / length).max(0.0)) * widths[j];
+                    let (point, frame) = (curve_places[j].0, frames[j]);
+                    local.iter().map(|p| point + frame * (*p * size)).collect::<Vec<_>>()
+                };
+                let points = place(at).into_iter().zip(place(at + 1)).map(|(p, q)| p.lerp(q, t)).collect();
+                Net { counts: base.counts, points }
             };
-            let points = place(at).into_iter().zip(place(at + 1)).map(|(p, q)| p.lerp(q, t)).collect();
-            sections.push(Net { counts: base.counts, points });
+            places.iter().map(section).collect()
+        };
+        // What holds for the curve need not for its sections, which are apart: where cells between two of them fold all the same, both are drawn together
+        // further.
+        let [p1, p2, _, p4] = base.corners();
+        let hand = (p2 - p1).cross(p4 - p1).dot(normal);
+        let mut allowed = allowed;
+        let mut made = sections(&drawn_together(&allowed, &lengths, reach));
+        for _ in 0..MOST_ROUNDS {
+            let below = |k: usize| if k == 0 { &base } else { &made[k - 1] };
+            let folded: Vec<usize> = (0..made.len()).filter(|&k| folds(below(k), &made[k], hand)).collect();
+            if folded.is_empty() {
+                break;
+            }
+            for k in folded {
+                let (from, to) = (if k == 0 { 0 } else { places[k - 1].0 }, (places[k].0 + 1).min(n - 1));
+                allowed[from..=to].iter_mut().for_each(|width| *width *= NARROWER);
+            }
+            made = sections(&drawn_together(&allowed, &lengths, reach));
         }
+        let heights_of = |&(at, t): &(usize, f64)| lengths[at] + (lengths[at + 1] - lengths[at]) * t;
+        let above: Vec<f64> = places.iter().map(heights_of).collect();
         let under = |p: &DVec3| climb(field, *p, &[-depth], None)[0];
         let below = Net { counts: base.counts, points: base.points.par_iter().map(under).collect() };
-        let heights = Heights {
-            below: vec![-depth],
-            above: (1..=count).map(|k| length * k as f64 / count as f64).collect(),
-            texture: [0.0, length],
-        };
-        (heights.volume(vec![below], base, sections), length)
+        let heights = Heights { below: vec![-depth], above, texture: [0.0, length] };
+        (heights.volume(vec![below], base, made), length)
     }
 
     /// The map from texture space: bilinear on the two layers around w, linear between them.
@@ -220,6 +238,43 @@ impl Volume {
         let t = ((uvw.z - low) / (high - low)).clamp(0.0, 1.0);
         self.layers[above - 1].bilinear(uvw.x, uvw.y).lerp(self.layers[above].bilinear(uvw.x, uvw.y), t)
     }
+}
+
+/// Where the sections of a curve are: the place before each, and the part of the way to the next. They are `spacing` apart, less where it bends; the last one is
+/// at the end.
+fn section_places(bends: &[DVec3], lengths: &[f64], spacing: f64) -> Vec<(usize, f64)> {
+    let n = lengths.len();
+    let mut so_far = vec![0.0];
+    for k in 1..n {
+        let bend = (bends[k - 1].length() + bends[k].length()) / 2.0;
+        so_far.push(so_far[k - 1] + (lengths[k] - lengths[k - 1]) * (1.0 / spacing).max(bend / TURN));
+    }
+    let count = (so_far[n - 1].ceil() as usize).clamp(4, MOST_SECTIONS);
+    let mut at = 0;
+    let place = |k: usize| {
+        let s = so_far[n - 1] * k as f64 / count as f64;
+        while at + 2 < n && so_far[at + 1] < s {
+            at += 1;
+        }
+        (at, ((s - so_far[at]) / (so_far[at + 1] - so_far[at]).max(1e-12)).clamp(0.0, 1.0))
+    };
+    (1..=count).map(place).collect()
+}
+
+/// Whether a cell between two nets of equal counts folds: its Jacobian has not the sign of `hand` at a corner.
+fn folds(low: &Net, high: &Net, hand: f64) -> bool {
+    let [nu, nv] = low.counts;
+    (0..nu * nv).any(|cell| {
+        let (i, j) = (cell / nv, cell % nv);
+        let corner = |u: usize, v: usize, w: usize| [low, high][w].at(i + u, j + v);
+        (0..8).any(|c| {
+            let [u, v, w] = [c >> 2, c >> 1 & 1, c & 1];
+            let by_u = corner(1, v, w) - corner(0, v, w);
+            let by_v = corner(u, 1, w) - corner(u, 0, w);
+            let by_w = corner(u, v, 1) - corner(u, v, 0);
+            by_u.cross(by_v).dot(by_w) * hand <= 0.0
+        })
+    })
 }
 
 /// Widths (0..1) of the sections along a curve that are nowhere more than `allowed`, and change by as much as the curve goes on over `reach` at most.

@@ -86,6 +86,11 @@ impl Source {
         Ok(Self { mesh, bounds, given: texture, lattices: BTreeMap::new() })
     }
 
+    /// Its polygons.
+    pub fn mesh(&self) -> &TriangleMesh {
+        &self.mesh
+    }
+
     /// Lengths of the box around the surface.
     pub fn size(&self) -> DVec3 {
         self.bounds.1 - self.bounds.0
@@ -165,15 +170,9 @@ pub fn warped(
             let uvw = DVec3::new((t.x + i) / f64::from(nu), (t.y + j) / f64::from(nv), t.z - push);
             transform.index_to_world(patch.place(uvw))
         };
-        let first = all.positions.len() as u32;
-        all.positions.par_extend(mesh.positions.par_iter().with_min_len(4096).map(place));
-        all.triangles.extend(mesh.triangles.iter().map(|t| t.map(|v| v + first)));
-        if let Some(colors) = &mesh.colors {
-            all.colors.get_or_insert_default().extend(colors);
-        }
-        if let Some(uvs) = &mesh.uvs {
-            all.uvs.get_or_insert_default().extend(uvs);
-        }
+        let positions = mesh.positions.par_iter().with_min_len(4096).map(place).collect();
+        let (colors, uvs) = (mesh.colors.clone(), mesh.uvs.clone());
+        all.append(TriangleMesh { positions, triangles: mesh.triangles.clone(), colors, uvs });
     }
     all
 }
@@ -201,7 +200,13 @@ pub(super) struct Solid<'a> {
 pub(super) struct Probe<'a>(Sampler<'a>, Sampler<'a>);
 
 impl<'a> Solid<'a> {
-    fn new(texture: &mut Source, base: &'a LevelSet, patch: &Patch, laying: &Laying, run: &RunOptions) -> Result<Self> {
+    pub fn new(
+        texture: &mut Source,
+        base: &'a LevelSet,
+        patch: &Patch,
+        laying: &Laying,
+        run: &RunOptions,
+    ) -> Result<Self> {
         let (lo, size) = (texture.bounds.0, texture.size());
         let tile = laying.tile.map(|n| f64::from(n.max(1)));
         let [typical, stretch] = patch.cells().stretch(size * DVec3::new(tile[0], tile[1], 1.0));
