@@ -51,6 +51,7 @@ mod bridge {
             found.configure(&mut bridge).opt_level(3).files([
                 "cpp/archive.cc",
                 "cpp/grid.cc",
+                "cpp/chunks.cc",
                 "cpp/vector.cc",
                 "cpp/reference_io.cc",
             ]);

@@ -24,6 +24,7 @@
 #include <cerrno>
 #include <cstring>
 #include <fstream>
+#include <iomanip>
 #include <map>
 #include <optional>
 #include <sstream>
@@ -237,12 +238,13 @@ class HashBuffer final : public std::streambuf {
 public:
     HashBuffer() { setp(block_.data(), block_.data() + block_.size()); }
 
+    /// 32 hexadecimal digits.
     std::string digest()
     {
         absorb();
         const auto [low, high] = lanes_.digest(length_);
         std::ostringstream text;
-        text << std::hex << high << '-' << low;
+        text << std::hex << std::setfill('0') << std::setw(16) << high << std::setw(16) << low;
         return text.str();
     }
 
@@ -675,16 +677,81 @@ struct Output::Impl {
 
 namespace {
 
+/// Passes a file on and takes its bytes in, all but its identity: OpenVDB makes that up anew for every file. One that follows from
+/// the content makes equal results equal files.
+class IdentifiedBuffer final : public std::streambuf {
+public:
+    explicit IdentifiedBuffer(std::streambuf& file) : file_(file) {}
+
+    /// Writes the identity in place of `made_up`. If that is not where this version of the format has it, it stays.
+    void identify(const std::string& made_up)
+    {
+        if (made_up.size() != kLength || made_up != seen_) return;
+        // A version 8 UUID (RFC 9562): digits of a vendor's own.
+        std::string id = hash_.digest();
+        id[12] = id[16] = '8';
+        for (const std::size_t at : {8, 13, 18, 23}) id.insert(at, 1, '-');
+        const auto end = file_.pubseekoff(0, std::ios_base::cur, std::ios_base::out);
+        const bool written = file_.pubseekpos(kPlace, std::ios_base::out) == pos_type(kPlace) &&
+            file_.sputn(id.data(), kLength) == kLength && file_.pubseekpos(end, std::ios_base::out) == end;
+        if (!written) throw std::ios_base::failure("the identity of the file");
+    }
+
+protected:
+    int_type overflow(int_type c) override
+    {
+        const char byte = traits_type::to_char_type(c);
+        return !traits_type::eq_int_type(c, traits_type::eof()) && xsputn(&byte, 1) == 1 ? c : traits_type::eof();
+    }
+
+    std::streamsize xsputn(const char* bytes, std::streamsize n) override
+    {
+        // The first bytes are written in order.
+        for (std::streamsize i = 0; i < n && at_ + i < kPlace + kLength; ++i) {
+            if (at_ + i >= kPlace) seen_.push_back(bytes[i]);
+        }
+        const std::streamsize known = std::clamp<std::streamsize>(kPlace + kLength - at_, 0, n);
+        hash_.sputn(bytes + known, n - known);
+        at_ += n;
+        return file_.sputn(bytes, n);
+    }
+
+    pos_type seekoff(off_type offset, std::ios_base::seekdir dir, std::ios_base::openmode mode) override
+    {
+        return at(file_.pubseekoff(offset, dir, mode));
+    }
+
+    pos_type seekpos(pos_type pos, std::ios_base::openmode mode) override { return at(file_.pubseekpos(pos, mode)); }
+
+    int sync() override { return file_.pubsync(); }
+
+private:
+    pos_type at(pos_type pos)
+    {
+        if (pos != pos_type(off_type(-1))) at_ = static_cast<std::streamoff>(pos);
+        return pos;
+    }
+
+    /// After the magic number, three versions and the flag of offsets.
+    static constexpr std::streamoff kPlace = 21, kLength = 36;
+    std::streambuf& file_;
+    std::streamoff at_ = 0;
+    std::string seen_;
+    HashBuffer hash_;
+};
+
 class Writer final : public vio::Archive {
 public:
     void write_to(std::streambuf& buffer, const Output::Impl& content, std::uint32_t compression)
     {
         const QuietOutput scope;
-        std::ostream stream(&buffer);
+        IdentifiedBuffer identified(buffer);
+        std::ostream stream(&identified);
         stream.exceptions(std::ios_base::badbit | std::ios_base::failbit);
         setCompression(compression);
         vio::Archive::write(stream, content.grids, /*seekable=*/true, content.metadata);
         stream.flush();
+        identified.identify(getUniqueTag());
     }
 };
 

@@ -4,11 +4,15 @@
 //! target, which POSIX and Windows do atomically. Whatever fails before the rename leaves the old file as it was and
 //! the temporary file is removed. A target that is a symbolic link is followed, so the link stays and the file behind
 //! it is replaced.
+//!
+//! A process that is killed leaves its temporary file behind. It held a lock on it, which ended with it: the next one that writes
+//! into the folder removes temporary files that nobody holds.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
 
 use tempfile::NamedTempFile;
 
@@ -16,6 +20,12 @@ use crate::{EditError, Result};
 
 /// As many links as Linux follows before it calls them a loop.
 const MAX_LINKS: usize = 40;
+
+/// How the names of temporary files begin.
+const PREFIX: &str = ".vdb-edit-";
+
+/// Age from which a temporary file without a lock counts as abandoned: a new one is locked only after it was made.
+const ABANDONED: Duration = Duration::from_secs(60);
 
 /// Replaces `path` by what `write` produces, or leaves it alone.
 ///
@@ -100,12 +110,7 @@ impl Pending {
             Err(_) => None,
         };
         let suffix = target.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".vdb-edit-").suffix(&suffix);
-        // Temporary files are private (0600) by default; a result should be as readable as any file the user creates.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        let file = builder.tempfile_in(folder_of(target)).map_err(|e| failed(path, e))?;
+        let file = temporary_in(folder_of(target), &suffix).map_err(|e| failed(path, e))?;
         let unfinished = Unfinished::new(file.path());
         Ok(Self { path: path.into(), target: target.into(), file, permissions, _unfinished: unfinished })
     }
@@ -118,13 +123,40 @@ impl Pending {
         if let Some(permissions) = permissions {
             fs::set_permissions(file.path(), permissions).map_err(|e| failed(&path, e))?;
         }
-        file.into_temp_path().persist(&target).map_err(|e| failed(&path, e.error))?;
+        file.persist(&target).map_err(|e| failed(&path, e.error))?;
         // The rename itself is durable once the folder is; not every file system lets a folder be synchronised.
         #[cfg(unix)]
         if let Ok(folder) = File::open(folder_of(&target)) {
             let _ = folder.sync_all();
         }
         Ok(())
+    }
+}
+
+/// A new temporary file in a folder.
+pub(crate) fn temporary_in(folder: &Path, suffix: &str) -> io::Result<NamedTempFile> {
+    remove_abandoned(folder);
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(PREFIX).suffix(suffix);
+    // Temporary files are private (0600) by default; a result should be as readable as any file the user creates.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let file = builder.tempfile_in(folder)?;
+    // Where files cannot be locked, abandoned ones stay.
+    let _ = file.as_file().try_lock();
+    Ok(file)
+}
+
+/// Removes the temporary files of a folder that processes left when they were killed. What cannot be removed stays.
+fn remove_abandoned(folder: &Path) {
+    let Ok(entries) = fs::read_dir(folder) else { return };
+    let is_ours = |entry: &fs::DirEntry| entry.file_name().to_string_lossy().starts_with(PREFIX);
+    for entry in entries.flatten().filter(is_ours) {
+        let age = entry.metadata().and_then(|m| m.modified()).map(|time| time.elapsed().unwrap_or_default());
+        let path = entry.path();
+        if age.is_ok_and(|age| age > ABANDONED) && File::open(&path).is_ok_and(|file| file.try_lock().is_ok()) {
+            let _ = fs::remove_file(path);
+        }
     }
 }
 
@@ -193,6 +225,24 @@ mod tests {
             fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
         names.sort();
         names
+    }
+
+    #[test]
+    fn abandoned_files_are_removed_and_no_others() {
+        let folder = tempfile::tempdir().unwrap();
+        let long_ago = std::time::SystemTime::now() - 2 * ABANDONED;
+        let make = |name: &str, time| {
+            let file = File::create(folder.path().join(name)).unwrap();
+            file.set_modified(time).unwrap();
+            file
+        };
+        drop(make(".vdb-edit-dead.vdb", long_ago));
+        drop(make(".vdb-edit-new.vdb", std::time::SystemTime::now()));
+        drop(make("mine.vdb", long_ago));
+        let held = make(".vdb-edit-held.vdb", long_ago);
+        held.try_lock().unwrap();
+        write_atomically(&folder.path().join("out"), |w| w.write_all(b"new")).unwrap();
+        assert_eq!(names(folder.path()), [".vdb-edit-held.vdb", ".vdb-edit-new.vdb", "mine.vdb", "out"]);
     }
 
     #[test]

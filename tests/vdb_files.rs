@@ -298,6 +298,22 @@ fn what_is_written_reads_back_bit_for_bit() {
 }
 
 #[test]
+fn equal_results_are_equal_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let bytes = |name: &str, radius: f64| {
+        let path = folder.path().join(name);
+        vdb::write(&path, &[result(&sphere(Transform::uniform(0.1), radius))], None, &WriteOptions::default()).unwrap();
+        std::fs::read(path).unwrap()
+    };
+    let (first, again, other) = (bytes("a.vdb", 6.0), bytes("b.vdb", 6.0), bytes("c.vdb", 6.5));
+    assert!(first == again);
+    // The identity: a UUID of version 8, after magic number, versions and a flag.
+    let identity = |file: &[u8]| String::from_utf8(file[21..57].to_vec()).unwrap();
+    assert_eq!((&identity(&first)[14..15], &identity(&first)[19..20]), ("8", "8"), "{}", identity(&first));
+    assert_ne!(identity(&first), identity(&other));
+}
+
+#[test]
 fn half_precision_rounds_and_is_kept() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("half.vdb");

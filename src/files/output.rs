@@ -152,6 +152,6 @@ pub fn writable(path: &Path) -> Result<()> {
     if !folder.is_dir() {
         return Err(EditError::output(path, format!("there is no folder `{}`", folder.display())));
     }
-    let probe = tempfile::Builder::new().prefix(".vdb-edit-").tempfile_in(folder);
+    let probe = atomic::temporary_in(folder, "");
     probe.map(drop).map_err(|e| EditError::output(path, format!("no file can be made in `{}`: {e}", folder.display())))
 }

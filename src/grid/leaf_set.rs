@@ -61,9 +61,10 @@ impl LeafSet {
         self.words.iter().enumerate().flat_map(|(page, &word)| PageLeaves::new(page, word).iter())
     }
 
-    /// The leaves by page, for parallel tasks.
-    pub fn par_pages(&self) -> impl IndexedParallelIterator<Item = PageLeaves> + '_ {
-        self.words.par_iter().enumerate().map(|(page, &word)| PageLeaves::new(page, word))
+    /// The leaves by page, for parallel tasks; pages without any are left out.
+    pub fn par_pages(&self) -> impl IndexedParallelIterator<Item = PageLeaves> + use<> {
+        let pages = self.words.iter().enumerate().filter(|(_, word)| **word != 0);
+        pages.map(|(page, &word)| PageLeaves::new(page, word)).collect::<Vec<_>>().into_par_iter()
     }
 }
 

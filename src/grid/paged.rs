@@ -153,14 +153,7 @@ impl<T: Pooled> Paged<T> {
         R: Send,
         F: Fn(PageLeaves, &mut [T]) -> R + Sync,
     {
-        self.pages
-            .par_iter_mut()
-            .enumerate()
-            .filter_map(|(page, data)| {
-                let word = set.word(page);
-                (word != 0).then(|| f(PageLeaves { page, word }, Self::own(data)))
-            })
-            .collect()
+        pages_of(&mut self.pages, set).into_par_iter().map(|(leaves, data)| f(leaves, Self::own(data))).collect()
     }
 
     /// As [`par_update_pages`](Self::par_update_pages) over two arrays of one grid at once.
@@ -170,15 +163,8 @@ impl<T: Pooled> Paged<T> {
         R: Send,
         F: Fn(PageLeaves, &mut [T], &mut [U]) -> R + Sync,
     {
-        self.pages
-            .par_iter_mut()
-            .zip(&mut other.pages)
-            .enumerate()
-            .filter_map(|(page, (a, b))| {
-                let word = set.word(page);
-                (word != 0).then(|| f(PageLeaves { page, word }, Self::own(a), Paged::own(b)))
-            })
-            .collect()
+        let pages = pages_of(self.pages.iter_mut().zip(&mut other.pages), set).into_par_iter();
+        pages.map(|(leaves, (a, b))| f(leaves, Self::own(a), Paged::own(b))).collect()
     }
 
     /// Calls `f` with every leaf of `set`, in parallel over pages.
@@ -197,12 +183,9 @@ impl<T: Pooled> Paged<T> {
     where
         F: Fn(PageLeaves, bool, &mut [T]) + Sync,
     {
-        self.pages.par_iter_mut().enumerate().for_each(|(page, data)| {
-            let word = set.word(page);
-            if word != 0 {
-                let (own, new) = Self::own_unwritten(data, word);
-                f(PageLeaves { page, word }, new, own);
-            }
+        pages_of(&mut self.pages, set).into_par_iter().for_each(|(leaves, data)| {
+            let (own, new) = Self::own_unwritten(data, leaves.word);
+            f(leaves, new, own);
         });
     }
 
@@ -213,16 +196,11 @@ impl<T: Pooled> Paged<T> {
         R: Send,
         F: Fn(PageLeaves, bool, &mut [T], &mut [U]) -> R + Sync,
     {
-        self.pages
-            .par_iter_mut()
-            .zip(&mut other.pages)
-            .enumerate()
-            .filter_map(|(page, (a, b))| {
-                let word = set.word(page);
-                (word != 0).then(|| {
-                    let (own, new) = Self::own_unwritten(a, word);
-                    f(PageLeaves { page, word }, new, own, Paged::own(b))
-                })
+        let pages = pages_of(self.pages.iter_mut().zip(&mut other.pages), set).into_par_iter();
+        pages
+            .map(|(leaves, (a, b))| {
+                let (own, new) = Self::own_unwritten(a, leaves.word);
+                f(leaves, new, own, Paged::own(b))
             })
             .collect()
     }
@@ -237,6 +215,13 @@ impl<T: Pooled> Drop for Paged<T> {
     fn drop(&mut self) {
         self.pages.drain(..).for_each(T::keep_page);
     }
+}
+
+/// Of `pages`, those that hold a leaf of `set`. Found before the work is divided: the pages of a region lie close together, and halves of all
+/// pages would leave a thread without any.
+fn pages_of<P>(pages: impl IntoIterator<Item = P>, set: &LeafSet) -> Vec<(PageLeaves, P)> {
+    let leaves = |(page, data)| (PageLeaves { page, word: set.word(page) }, data);
+    pages.into_iter().enumerate().map(leaves).filter(|(leaves, _)| leaves.word != 0).collect()
 }
 
 /// The leaves of a set that lie in one page.

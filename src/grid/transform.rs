@@ -1,6 +1,6 @@
 //! Index space ↔ world space, uniform: rotation, one scale, translation.
 
-use glam::{DAffine3, DMat3, DVec3, IVec3};
+use glam::{BVec3, DAffine3, DMat3, DVec3, IVec3};
 
 /// Relative difference of axis lengths, and cosine between axes, up to which a transform counts as uniform and unsheared.
 /// Files store matrices in f64; products of a few rotations stay below 1e-12, and a real anisotropy is never this small.
@@ -78,6 +78,13 @@ impl Transform {
     /// Index-space position of a world position.
     pub fn world_to_index(&self, xyz: DVec3) -> DVec3 {
         self.to_index.transform_point3(xyz)
+    }
+
+    /// Index-space box around a world-space box, both as their lowest and highest corner.
+    pub fn box_to_index(&self, (lo, hi): (DVec3, DVec3)) -> (DVec3, DVec3) {
+        let corner = |c: u8| DVec3::select(BVec3::new(c & 1 == 1, c & 2 == 2, c & 4 == 4), hi, lo);
+        let corners = (0..8).map(|c| self.world_to_index(corner(c)));
+        corners.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), p| (lo.min(p), hi.max(p)))
     }
 
     /// World direction of an index-space direction: rotated, not scaled.

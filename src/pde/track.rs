@@ -1,5 +1,7 @@
 //! Tracking: the band follows the surface. Dilate by one voxel, renormalise, trim (OpenVDB's `LevelSetTracker::track`).
 
+use rayon::prelude::*;
+
 use super::SolverOptions;
 use super::step::{Emptied, Target};
 use super::tracker::Tracker;
@@ -22,7 +24,7 @@ impl Tracker<'_> {
 
     /// Activates the face neighbours of the voxels that may have moved. They start at ±background.
     pub fn dilate_band(&mut self) {
-        let moving = self.moving();
+        let mut moving = self.moving();
         let reached = self.reached_leaves(&moving);
         self.domain.include_old(self.grid, &reached);
         let added = self.grid.add_leaves(&self.grid.absent_beside(&moving, self.domain.leaves()));
@@ -32,8 +34,9 @@ impl Tracker<'_> {
             buffer.par_update(&new, |id, values| values.clone_from(grid.values(id)));
         }
         self.domain.include_new(self.grid, &added);
-        // Asked again: slots of new leaves may have belonged to others before.
-        let moving = self.moving();
+        // Slots of new leaves may have belonged to others before.
+        moving.grow(self.grid.value_pages().page_count(), LeafMask::EMPTY);
+        added.iter().for_each(|&id| *moving.get_mut(id) = LeafMask::EMPTY);
         self.grid.activate_beside(&moving, self.domain.leaves());
         if let Some(region) = self.region {
             self.domain.weigh(self.grid, &self.transform, region);
@@ -73,16 +76,15 @@ impl Tracker<'_> {
         if !self.domain.is_local() {
             return Vec::new();
         }
-        let around = self.grid.neighbours();
-        let mut reached = Vec::new();
-        for id in self.domain.leaves().iter() {
-            for face in Face::ALL {
-                let n = around[id.index()][neighbour_index(face.step())];
-                if !n.is_sentinel() && !self.domain.leaves().contains(n) && !moving.get(id).spill(face).is_empty() {
-                    reached.push(n);
-                }
-            }
-        }
-        reached
+        let (around, leaves) = (self.grid.neighbours(), self.domain.leaves());
+        let beside = |id: LeafId| {
+            let neighbour = move |face: Face| around[id.index()][neighbour_index(face.step())];
+            let reached = move |face: &Face| {
+                let n = neighbour(*face);
+                !n.is_sentinel() && !leaves.contains(n) && !moving.get(id).spill(*face).is_empty()
+            };
+            Face::ALL.into_iter().filter(reached).map(neighbour)
+        };
+        leaves.par_pages().flat_map_iter(|page| page.iter().flat_map(beside)).collect()
     }
 }

@@ -44,19 +44,16 @@ pub trait Region: Send + Sync {
 }
 
 /// Museth's C¹ ramp P: 0 below 0, 2β² up to ½, 1 − 2(β − 1)² up to 1, then 1.
+#[inline(always)]
 pub fn ramp(beta: f64) -> f64 {
-    if beta <= 0.0 {
-        0.0
-    } else if beta <= 0.5 {
-        2.0 * beta * beta
-    } else if beta < 1.0 {
-        1.0 - 2.0 * (beta - 1.0) * (beta - 1.0)
-    } else {
-        1.0
-    }
+    // Without branches, so that loops over it are vector code.
+    let beta = beta.max(0.0).min(1.0);
+    let (rising, settling) = (2.0 * beta * beta, 1.0 - 2.0 * (beta - 1.0) * (beta - 1.0));
+    if beta <= 0.5 { rising } else { settling }
 }
 
 /// P stretched to rise from `low` to `high`; the step at `high` where they coincide.
+#[inline(always)]
 pub fn ramp_between(value: f64, low: f64, high: f64) -> f64 {
     if high <= low { f64::from(u8::from(value > high)) } else { ramp((value - low) / (high - low)) }
 }

@@ -3,10 +3,12 @@
 //! Each closed shape has a function s that is 0 at its centre, 1 on its boundary and grows linearly along rays from the
 //! centre ("0.9" is 90 % of the size in every direction). The weight is D = 1 − P(s; s_min, s_max).
 
+use fearless_simd::Simd;
 use glam::{DMat3, DVec3};
 
 use super::{Region, ramp_between};
 use crate::error::{EditError, Result};
+use crate::stencil::simd::{Work, dispatch};
 
 /// A closed shape or half space; lengths in world units.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +41,7 @@ pub enum Shape {
 
 impl Shape {
     /// The radially linear s at a local position.
+    #[inline(always)]
     fn size_fraction(&self, q: DVec3) -> f64 {
         match *self {
             Self::Sphere { radius } => q.length() / radius,
@@ -121,14 +124,57 @@ impl Primitive {
     }
 }
 
-impl Region for Primitive {
-    fn weight(&self, xyz: DVec3) -> f32 {
-        let local = self.axes.transpose() * (xyz - self.centre);
-        let s = self.shape.size_fraction(local);
+impl Primitive {
+    /// α at a position, for the shape of this primitive.
+    #[inline(always)]
+    fn weight_in(&self, shape: &Shape, xyz: DVec3) -> f32 {
+        let s = shape.size_fraction(self.axes.transpose() * (xyz - self.centre));
         if self.soft[0] == self.soft[1] {
             return f32::from(u8::from(s < self.soft[1]));
         }
         (1.0 - ramp_between(s, self.soft[0], self.soft[1])) as f32
+    }
+
+    #[inline(always)]
+    fn weigh_in(&self, shape: &Shape, xyz: &[DVec3], alpha: &mut [f32]) {
+        for (alpha, xyz) in alpha.iter_mut().zip(xyz) {
+            *alpha = self.weight_in(shape, *xyz);
+        }
+    }
+}
+
+/// α at several positions.
+struct Weights<'a> {
+    of: &'a Primitive,
+    xyz: &'a [DVec3],
+    alpha: &'a mut [f32],
+}
+
+impl Work for Weights<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let Self { of, xyz, alpha } = self;
+        // A loop for each shape: what must be told apart in a loop is no vector code.
+        match of.shape {
+            Shape::Sphere { radius } => of.weigh_in(&Shape::Sphere { radius }, xyz, alpha),
+            Shape::Box { half_size } => of.weigh_in(&Shape::Box { half_size }, xyz, alpha),
+            Shape::Cylinder { radius, half_height } => {
+                of.weigh_in(&Shape::Cylinder { radius, half_height }, xyz, alpha);
+            }
+            Shape::Superellipsoid { radii, exponents } => {
+                of.weigh_in(&Shape::Superellipsoid { radii, exponents }, xyz, alpha);
+            }
+        }
+    }
+}
+
+impl Region for Primitive {
+    fn weight(&self, xyz: DVec3) -> f32 {
+        self.weight_in(&self.shape, xyz)
+    }
+
+    fn weights(&self, xyz: &[DVec3], alpha: &mut [f32]) {
+        dispatch(Weights { of: self, xyz, alpha });
     }
 
     fn bounds(&self) -> Option<(DVec3, DVec3)> {

@@ -1,21 +1,27 @@
 //! A region evaluated on a grid: α at the active voxels of the leaves that it touches.
 
+use fearless_simd::Simd;
+use glam::DVec3;
 use rayon::prelude::*;
 
 use super::Region;
 use crate::grid::{
-    Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafSet, LeafValues, PAGE_LEAVES, Paged, Transform, offset_to_local,
+    Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafSet, LeafValues, PAGE_LEAVES, PageLeaves, Paged, Transform,
+    offset_to_local,
 };
+use crate::stencil::simd::{Work, dispatch};
 
 /// α at the active voxels of a grid, by leaf slot. Voxels are looked at when they become active. Only leaves at the region's rim have
 /// values of their own.
 pub struct RegionWeights {
     /// Where the values of a leaf are, by slot.
     places: Vec<Place>,
-    /// The leaves with values of their own; a sentinel in the place of those that are gone.
-    rim: Vec<(LeafId, LeafValues)>,
-    /// Places in `rim` that are free.
-    free: Vec<u32>,
+    /// α of the leaves with values of their own, by slots that are numbered here; 0 where no voxel was active yet.
+    rim: Paged<LeafValues>,
+    /// The leaf of each of these slots.
+    rim_leaves: Vec<LeafId>,
+    /// The slots that are free.
+    free: Vec<LeafId>,
     /// Where α is above 0, as far as it is known.
     positive: Paged<LeafMask>,
     known: Paged<LeafMask>,
@@ -30,8 +36,8 @@ enum Place {
     Unknown,
     /// α = 1 in the whole leaf.
     One,
-    /// In the list of the rim.
-    Rim(u32),
+    /// In a slot of the rim.
+    Rim(LeafId),
 }
 
 static ZERO: LeafValues = LeafValues([0.0; LEAF_VOXELS]);
@@ -42,13 +48,20 @@ impl RegionWeights {
     pub fn new(grid: &Grid, transform: &Transform, region: &dyn Region) -> Self {
         let mut weights = Self {
             places: Vec::new(),
-            rim: Vec::new(),
+            rim: Paged::default(),
+            rim_leaves: Vec::new(),
             free: Vec::new(),
             positive: Paged::default(),
             known: Paged::default(),
             leaves: LeafSet::default(),
         };
-        let touched = |id: &LeafId| range(grid, transform, region, *id)[1] > 0.0;
+        // In index space a leaf is beside a box at a glance.
+        let bounds = region.bounds().map(|bounds| transform.box_to_index(bounds));
+        let near = |id| {
+            let origin = grid.origin(id).as_dvec3();
+            bounds.is_none_or(|(lo, hi)| (origin + f64::from(LEAF_DIM)).cmpge(lo).all() && origin.cmple(hi).all())
+        };
+        let touched = |id: &LeafId| near(*id) && range(grid, transform, region, *id)[1] > 0.0;
         let touched: Vec<_> = grid.leaves().par_iter().copied().filter(touched).collect();
         weights.evaluate(grid, transform, region, &touched.into_iter().collect());
         weights
@@ -59,49 +72,70 @@ impl RegionWeights {
         self.grow(grid.value_pages().page_count());
         let known = &self.known;
         let unknown = |id| grid.mask(id).zip(*known.get(id), |active, known| active & !known);
-        let new: Vec<LeafId> = leaves.iter().filter(|&id| !unknown(id).is_empty()).collect();
-        let whole = |id: &LeafId| known.get(*id).is_empty() && range(grid, transform, region, *id)[0] == 1.0;
-        let whole: Vec<bool> = new.par_iter().map(whole).collect();
-        for (&id, whole) in new.iter().zip(whole) {
+        // Leaves with voxels to look at, and whether α = 1 in all of one.
+        let look = |id| {
+            let whole = || known.get(id).is_empty() && range(grid, transform, region, id)[0] == 1.0;
+            (!unknown(id).is_empty()).then(|| (id, whole()))
+        };
+        let new: Vec<_> = leaves.par_pages().flat_map_iter(|leaves| leaves.iter().filter_map(look)).collect();
+        let mut touched = LeafSet::default();
+        for &(id, whole) in &new {
             let place = &mut self.places[id.index()];
             if whole {
                 *place = Place::One;
-            } else if let Place::Unknown = place {
+                continue;
+            }
+            if let Place::Unknown = place {
                 let free = self.free.pop().unwrap_or_else(|| {
-                    self.rim.push((LeafId::OUTSIDE, ZERO.clone()));
-                    self.rim.len() as u32 - 1
+                    self.rim_leaves.push(id);
+                    LeafId::new(self.rim_leaves.len() - 1)
                 });
-                self.rim[free as usize].0 = id;
+                self.rim_leaves[free.index()] = id;
                 *place = Place::Rim(free);
             }
+            if let Place::Rim(slot) = *place {
+                touched.insert(slot);
+            }
         }
-        let set: LeafSet = new.iter().copied().collect();
-        self.rim.par_iter_mut().filter(|(id, _)| set.contains(*id)).for_each(|(id, alpha)| {
-            let origin = grid.origin(*id);
-            let offsets: Vec<usize> = unknown(*id).iter().collect();
-            let xyz: Vec<_> =
-                offsets.iter().map(|&offset| transform.voxel_to_world(origin + offset_to_local(offset))).collect();
-            let mut found = [0.0; LEAF_VOXELS];
-            region.weights(&xyz, &mut found);
-            for (offset, found) in offsets.into_iter().zip(found) {
-                alpha.0[offset] = found.clamp(0.0, 1.0);
+        self.rim.grow_unwritten(self.rim_leaves.len().div_ceil(PAGE_LEAVES));
+        let rim_leaves = &self.rim_leaves;
+        let found = self.rim.par_update_pages(&touched, |slots, alpha| {
+            let mut places = [DVec3::ZERO; LEAF_VOXELS];
+            let mut found = Vec::with_capacity(slots.iter().count());
+            for slot in slots.iter() {
+                let id = rim_leaves[slot.index()];
+                let alpha = &mut alpha[PageLeaves::slot(slot)];
+                if known.get(id).is_empty() {
+                    alpha.0.fill(0.0);
+                }
+                let mut positive = LeafMask::EMPTY;
+                let (new, origin) = (unknown(id), grid.origin(id).as_dvec3());
+                let positive_here = &mut positive;
+                dispatch(RimLeaf {
+                    region,
+                    transform,
+                    origin,
+                    new,
+                    alpha,
+                    positive: positive_here,
+                    places: &mut places,
+                });
+                found.push((id, positive));
             }
+            found
         });
-        let (places, rim) = (&self.places, &self.rim);
-        self.positive.par_update(&set, |id, positive| {
-            if let Place::Rim(place) = places[id.index()] {
-                let alpha = &rim[place as usize].1;
-                unknown(id).iter().for_each(|offset| positive.set(offset, alpha.0[offset] > 0.0));
-            } else {
-                *positive = LeafMask::FULL;
+        for (id, new) in found.into_iter().flatten() {
+            let positive = self.positive.get_mut(id);
+            *positive = positive.zip(new, |old, new| old | new);
+            let known = self.known.get_mut(id);
+            *known = known.zip(grid.mask(id), |known, active| known | active);
+            if !positive.is_empty() {
+                self.leaves.insert(id);
             }
-        });
-        let positive = &self.positive;
-        self.known.par_update(&set, |id, known| {
-            let all = *positive.get(id) == LeafMask::FULL;
-            *known = if all { LeafMask::FULL } else { known.zip(grid.mask(id), |known, active| known | active) };
-        });
-        for id in new.into_iter().filter(|id| !self.positive.get(*id).is_empty()) {
+        }
+        for (id, _) in new.into_iter().filter(|(_, whole)| *whole) {
+            *self.positive.get_mut(id) = LeafMask::FULL;
+            *self.known.get_mut(id) = LeafMask::FULL;
             self.leaves.insert(id);
         }
     }
@@ -119,9 +153,8 @@ impl RegionWeights {
             self.leaves.remove(id);
             *self.known.get_mut(id) = LeafMask::EMPTY;
             *self.positive.get_mut(id) = LeafMask::EMPTY;
-            if let Place::Rim(place) = std::mem::take(&mut self.places[id.index()]) {
-                self.rim[place as usize].0 = LeafId::OUTSIDE;
-                self.free.push(place);
+            if let Place::Rim(slot) = std::mem::take(&mut self.places[id.index()]) {
+                self.free.push(slot);
             }
         }
     }
@@ -137,7 +170,7 @@ impl RegionWeights {
         match self.places[id.index()] {
             Place::Unknown => &ZERO,
             Place::One => &ONE,
-            Place::Rim(place) => &self.rim[place as usize].1,
+            Place::Rim(slot) => self.rim.get(slot),
         }
     }
 
@@ -145,6 +178,45 @@ impl RegionWeights {
     #[inline(always)]
     pub fn positive(&self, id: LeafId) -> LeafMask {
         *self.positive.get(id)
+    }
+}
+
+/// α at the voxels `new` of a leaf. As vector work because bits are found one by one otherwise.
+struct RimLeaf<'a> {
+    region: &'a dyn Region,
+    transform: &'a Transform,
+    origin: DVec3,
+    new: LeafMask,
+    alpha: &'a mut LeafValues,
+    positive: &'a mut LeafMask,
+    places: &'a mut [DVec3; LEAF_VOXELS],
+}
+
+impl Work for RimLeaf<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let to_world = self.transform.to_world();
+        let mut count = 0;
+        self.new.for_each(
+            #[inline(always)]
+            |offset| {
+                let ijk = self.origin + offset_to_local(offset).as_dvec3();
+                self.places[count] = to_world.transform_point3(ijk);
+                count += 1;
+            },
+        );
+        let mut found = [0.0; LEAF_VOXELS];
+        self.region.weights(&self.places[..count], &mut found[..count]);
+        let mut next = 0;
+        self.new.for_each(
+            #[inline(always)]
+            |offset| {
+                let alpha = found[next].clamp(0.0, 1.0);
+                next += 1;
+                self.alpha.0[offset] = alpha;
+                self.positive.0[offset >> 6] |= u64::from(alpha > 0.0) << (offset & 63);
+            },
+        );
     }
 }
 

@@ -1,6 +1,7 @@
 //! Reading: the listing of a file, and its level sets.
 
-use std::io::Read;
+use std::fs::File;
+use std::io::{BufReader, Cursor, Read, Seek};
 use std::path::Path;
 
 use cxx::UniquePtr;
@@ -11,7 +12,7 @@ use super::band::{Band, BandFacts, diagnose_band};
 use super::bridge::ffi;
 use super::listing::{FileListing, Precision};
 use super::select::select_level_set;
-use super::structure::{START_BYTES, check_start};
+use super::structure::{START_BYTES, check_headers, check_start};
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, LEAF_DIM, LeafMask, LeafValues, MAX_COORD, PageLeaves};
 use crate::levelset::LevelSet;
@@ -149,11 +150,17 @@ fn open_archive(path: &Path, headers_only: bool) -> Result<UniquePtr<ffi::Archiv
         Some(bytes) => {
             let bytes = bytes.map_err(|e| fail(format!("cannot be read: {e}")))?;
             check_start(&bytes[..bytes.len().min(START_BYTES)], newest).map_err(fail)?;
+            check_headers(Cursor::new(&bytes), bytes.len() as u64).map_err(fail)?;
             ffi::read_bytes(&bytes, headers_only)
         }
         None => {
-            let start = read_start(path).map_err(|e| fail(format!("cannot be read: {e}")))?;
+            let unreadable = |e| fail(format!("cannot be read: {e}"));
+            let mut file = BufReader::new(File::open(path).map_err(unreadable)?);
+            let start = read_all((&mut file).take(START_BYTES as u64)).map_err(unreadable)?;
             check_start(&start, newest).map_err(fail)?;
+            file.rewind().map_err(unreadable)?;
+            let size = file.get_ref().metadata().map_err(unreadable)?.len();
+            check_headers(file, size).map_err(fail)?;
             ffi::read_path(path.as_os_str().as_encoded_bytes(), headers_only)
         }
     };
@@ -164,10 +171,6 @@ fn read_all(mut from: impl Read) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     from.read_to_end(&mut bytes)?;
     Ok(bytes)
-}
-
-fn read_start(path: &Path) -> std::io::Result<Vec<u8>> {
-    read_all(std::fs::File::open(path)?.take(START_BYTES as u64))
 }
 
 /// Makes active voxels that half precision has rounded up to the background inactive, as they would be if they were so in float.

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::bridge::ffi;
 use super::listing::{Compression, Precision};
 use super::read::{PIPE, VdbFile};
-use crate::atomic::{Unfinished, final_target};
+use crate::atomic::{Unfinished, final_target, temporary_in};
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, Transform};
 use crate::levelset::{Field, LevelSet};
@@ -275,7 +275,7 @@ impl Target<'_> {
             _ => PathBuf::from("."),
         };
         let in_folder = format!("no file can be made in {}", folder.display());
-        let temporary = new_file_in(&folder).map_err(self.io(&in_folder))?;
+        let temporary = temporary_in(&folder, ".vdb").map_err(self.io(&in_folder))?;
         let _unfinished = Unfinished::new(temporary.path());
         let name = temporary.path().as_os_str().as_encoded_bytes();
         content.as_mut().write_path(name, compression).map_err(|e| self.error(e.what()))?;
@@ -309,16 +309,4 @@ impl Target<'_> {
         let difference = content.verify(&archive).map_err(|e| failed(e.what()))?;
         if difference.is_empty() { Ok(()) } else { Err(failed(&difference)) }
     }
-}
-
-fn new_file_in(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".vdb-edit-").suffix(".tmp");
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        // As any new file, subject to the umask; temporary files are private otherwise.
-        builder.permissions(std::fs::Permissions::from_mode(0o666));
-    }
-    builder.tempfile_in(folder)
 }
