@@ -156,6 +156,13 @@ impl Interpolant {
         self.points.is_empty()
     }
 
+    /// The points at which the sum has a kink, and the slopes of the cones a·|x − p| that they add to it.
+    pub fn cones(&self) -> impl Iterator<Item = (DVec3, DVec3)> + '_ {
+        let has = self.basis == Basis::Linear;
+        let all = self.points.iter().zip(&self.weights).filter(move |_| has);
+        all.map(|(p, w)| (self.centre + *p * self.unit, *w / self.unit))
+    }
+
     #[inline(always)]
     fn sum(&self, x: DVec3, kernel: impl Fn(f64) -> f64) -> DVec3 {
         self.points.iter().zip(&self.weights).map(|(p, w)| *w * kernel(p.distance_squared(x))).sum()

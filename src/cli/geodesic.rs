@@ -14,7 +14,6 @@ use super::{Verb, args, edit, files, table};
 use crate::error::{EditError, Result};
 use crate::files::output::Written;
 use crate::files::{input, volume};
-use crate::levelset::Field;
 use crate::mesh::level_set_to_mesh;
 use crate::ops::Vector;
 use crate::render::distance_colors;
@@ -72,7 +71,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let loaded = input::load_whole(&paths, &options, &mut warnings, &context.run)?;
     let Some(input) = loaded.first() else { return Ok(()) };
     let found = input.level_set.geodesic(&from, &context.run)?;
-    let field = reached(&found.field);
+    let field = found.reached();
     let farthest = field.range().map_or(0.0, |(_, most)| most);
     if found.unreachable > 0 {
         let how = if output.is_mesh() { "grey" } else { "left without a value" };
@@ -108,16 +107,4 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         return Ok(());
     }
     context.reporter.result(&value, text)
-}
-
-/// The field without the voxels whose value is infinite.
-pub(super) fn reached(field: &Field) -> Field {
-    let mut grid = field.grid().clone();
-    grid.update_all(|_, values, mask| {
-        for at in mask.iter().filter(|&at| !values.0[at].is_finite()).collect::<Vec<_>>() {
-            values.0[at] = 0.0;
-            mask.set(at, false);
-        }
-    });
-    Field::new(grid, *field.transform())
 }

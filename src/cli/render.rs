@@ -9,7 +9,6 @@ use glam::DVec3;
 use serde_json::{Map, json};
 
 use super::context::Context;
-use super::geodesic::reached;
 use super::{Verb, args, files};
 use crate::atomic::write_atomically;
 use crate::error::{EditError, Result};
@@ -169,7 +168,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         _ => None,
     };
     let distances = match color {
-        Color::Geodesic => Some(reached(&input.level_set.geodesic(&from, &context.run)?.field)),
+        Color::Geodesic => Some(input.level_set.geodesic(&from, &context.run)?.reached()),
         _ => None,
     };
     let label = |xyz: DVec3| components.as_ref()?.nearest(input.level_set.transform().world_to_index(xyz));

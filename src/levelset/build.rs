@@ -14,7 +14,7 @@ const LARGEST_BLOCK: i32 = 1 << 30;
 const OPERATION: &str = "sampling a distance function";
 
 /// Bytes that a leaf costs while it is built: its values twice (collected, then in pages), mask and tables.
-pub(crate) const BYTES_A_LEAF: u64 = 2 * 2048 + 512;
+pub const BYTES_A_LEAF: u64 = 2 * 2048 + 512;
 
 impl LevelSet {
     /// The level set of a signed distance function given in **index space and voxels**: `distance(ijk)` is negative inside,
@@ -63,7 +63,7 @@ impl LevelSet {
 }
 
 /// A grid of the given leaves, sorted here; the signs of the space between are flooded from them.
-pub(crate) fn grid_of_leaves(background: f32, leaves: Vec<(IVec3, LeafValues, LeafMask)>) -> Grid {
+pub fn grid_of_leaves(background: f32, leaves: Vec<(IVec3, LeafValues, LeafMask)>) -> Grid {
     grid_of_parts(background, &[leaves])
 }
 

@@ -48,6 +48,20 @@ pub struct Geodesic {
     pub unreachable: u64,
 }
 
+impl Geodesic {
+    /// The field without the voxels whose value is infinite.
+    pub fn reached(&self) -> Field {
+        let mut grid = self.field.grid().clone();
+        grid.update_all(|_, values, mask| {
+            for at in mask.iter().filter(|&at| !values.0[at].is_finite()).collect::<Vec<_>>() {
+                values.0[at] = 0.0;
+                mask.set(at, false);
+            }
+        });
+        Field::new(grid, *self.field.transform())
+    }
+}
+
 impl LevelSet {
     /// The distance along the surface from the nearest of `sources`, world positions on the surface or within the band; each counts as the surface point closest to it.
     pub fn geodesic(&self, sources: &[DVec3], run: &RunOptions) -> Result<Geodesic> {

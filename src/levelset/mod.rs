@@ -28,7 +28,8 @@ mod violation;
 
 use glam::{DVec3, IVec3};
 
-pub(crate) use build::{BYTES_A_LEAF, grid_of_leaves, grid_of_parts};
+pub(crate) use build::grid_of_parts;
+pub use build::{BYTES_A_LEAF, grid_of_leaves};
 pub use components::Components;
 pub use curvature::{CurvatureKind, curvature, curvature_of};
 pub use curve::curve_length;

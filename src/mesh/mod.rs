@@ -69,6 +69,25 @@ impl TriangleMesh {
         self.triangles[t].map(|v| self.positions[v as usize])
     }
 
+    /// Adds another mesh. Attributes that only one of the two has are dropped.
+    pub fn append(&mut self, other: Self) {
+        let (first, was_empty) = (self.positions.len() as u32, self.positions.is_empty());
+        self.positions.extend(other.positions);
+        self.triangles.extend(other.triangles.iter().map(|t| t.map(|v| v + first)));
+        fn joined<T>(own: Option<Vec<T>>, others: Option<Vec<T>>, was_empty: bool) -> Option<Vec<T>> {
+            match (own, others) {
+                (Some(mut own), Some(others)) => {
+                    own.extend(others);
+                    Some(own)
+                }
+                (None, others) if was_empty => others,
+                _ => None,
+            }
+        }
+        self.colors = joined(self.colors.take(), other.colors, was_empty);
+        self.uvs = joined(self.uvs.take(), other.uvs, was_empty);
+    }
+
     /// Smallest box around the positions that triangles use; `None` without triangles.
     pub fn bounding_box(&self) -> Option<(DVec3, DVec3)> {
         self.triangles

@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
-use crate::ops::{RegionSpecs, parse, words};
+use crate::ops::{RegionSpecs, Vector, parse, words};
 use crate::render::{CameraSpec, ColorBy, Frame, Image, RenderOptions, UpAxis, render};
 use crate::run::RunOptions;
 
@@ -31,6 +31,8 @@ words! {
         Region = "region",
         /// Distance of the first input to the second.
         Difference = "difference",
+        /// Distance along the surface from `from`, in stripes with `stripes`; along that of the second input, if there is one.
+        Geodesic = "geodesic",
     }
 }
 
@@ -51,10 +53,16 @@ pub(super) struct Picture {
     /// Where to: a .png. `####`, `%04d` and `$F4` become the frame.
     #[schemars(extend("x-kind" = "FILE"))]
     pub path: String,
-    /// What the colours say; `region` needs `region`, `difference` two inputs and draws the first.
+    /// What the colours say; `region` needs `region`, `geodesic` `from`; `difference` takes two inputs and draws the first, as `geodesic` may.
     pub color_by: Color,
     /// The region that is shown; several multiply, `or …` and `not …` combine.
     pub region: RegionSpecs,
+    /// The points on the surface from which `geodesic` measures.
+    #[schemars(extend("x-list" = true, "x-kind" = "x,y,z"))]
+    pub from: Vec<Vector>,
+    /// With `geodesic`: stripes of this width (world units) of two colours in turn.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stripes: Option<f64>,
     /// Width and height in pixels, of each input's picture.
     pub size: [u32; 2],
     /// Where from, in degrees: around the up axis, above the horizon and, if given, field of view.
@@ -78,6 +86,8 @@ impl Default for Picture {
             path: String::new(),
             color_by: Color::Clay,
             region: RegionSpecs::default(),
+            from: Vec::new(),
+            stripes: None,
             size: [options.width, options.height],
             camera: vec![camera.azimuth, camera.elevation],
             up: Up::Y,
@@ -104,6 +114,15 @@ impl Picture {
             let accepted = "`color_by = \"region\"` and `region` go together";
             return refuse("region", format!("{:?}", read.region.0), accepted);
         }
+        if (read.color_by == Color::Geodesic) == read.from.is_empty() {
+            let accepted = "`color_by = \"geodesic\"` and `from`, points on the surface, go together";
+            return refuse("from", format!("{} points", read.from.len()), accepted);
+        }
+        if let Some(width) = read.stripes
+            && (read.color_by != Color::Geodesic || !(width > 0.0 && width.is_finite()))
+        {
+            return refuse("stripes", width.to_string(), "a positive width, with `color_by = \"geodesic\"`");
+        }
         if let Some([a, b, c, d, e, f]) = read.frame_box
             && !(a < d && b < e && c < f)
         {
@@ -119,6 +138,11 @@ impl Picture {
         if self.color_by == Color::Difference && inputs != 2 {
             let accepted = "two inputs: the one that is drawn, and the one that it is compared with";
             return Err(EditError::parameter("render", "color_by", "\"difference\"", accepted));
+        }
+        if self.color_by == Color::Geodesic && inputs > 2 {
+            let accepted =
+                "one input, or two: the one that is drawn, and the one along whose surface distances are measured";
+            return Err(EditError::parameter("render", "color_by", "\"geodesic\"", accepted));
         }
         Ok(())
     }
@@ -143,7 +167,8 @@ impl Picture {
     /// Draws the inputs.
     pub fn draw(&self, inputs: &[LevelSet], run: &RunOptions) -> Result<Image> {
         let mut options = self.options();
-        let drawn = if self.color_by == Color::Difference { &inputs[..1.min(inputs.len())] } else { inputs };
+        let first = matches!(self.color_by, Color::Difference | Color::Geodesic);
+        let drawn = if first { &inputs[..1.min(inputs.len())] } else { inputs };
         if self.frame_box.is_none() && drawn.len() > 1 {
             let boxes = drawn.iter().filter_map(LevelSet::world_bounds);
             if let Some((lo, hi)) = boxes.reduce(|(a, b), (c, d)| (a.min(c), b.max(d))) {
@@ -166,8 +191,23 @@ impl Picture {
             Color::Component => Some(level_set.components(run)?),
             _ => None,
         };
+        let distances = match self.color_by {
+            Color::Geodesic => {
+                let from: Vec<DVec3> = self.from.iter().map(|p| p.0).collect();
+                Some(other.unwrap_or(level_set).geodesic(&from, run)?.reached())
+            }
+            _ => None,
+        };
+        let stripe = |xyz: DVec3| {
+            let (field, width) = (distances.as_ref()?, self.stripes?);
+            let ijk = field.transform().world_to_index(xyz);
+            let distance = crate::levelset::Field::trilinear(&mut field.accessor(), ijk)?;
+            Some((f64::from(distance) / width) as u32 % 2)
+        };
         let label = |xyz: DVec3| components.as_ref()?.nearest(level_set.transform().world_to_index(xyz));
         let color_by = match (self.color_by, &region, other) {
+            (Color::Geodesic, ..) if self.stripes.is_some() => ColorBy::Label(&stripe),
+            (Color::Geodesic, ..) => distances.as_ref().map_or(ColorBy::Clay, ColorBy::Geodesic),
             (Color::Curvature, ..) => ColorBy::Curvature,
             (Color::Normal, ..) => ColorBy::Normal,
             (Color::Component, ..) => ColorBy::Label(&label),

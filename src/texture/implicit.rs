@@ -1,19 +1,21 @@
 //! The implicit map: radial basis functions from places to (u, v, w) through the particles (Brodersen et al. 2007, section 3), evaluated near the
 //! texture's surface only.
 //!
-//! A sum over all particles is taken at the nodes of a lattice of half the particles' spacing and interpolated by Catmull and Rom's splines between them. Blocks without
+//! A sum over all particles is taken at the nodes of a lattice of at most 0.7 of the particles' spacing and interpolated by Catmull and Rom's splines between them.
+//! What particles in a block or beside it add is not interpolated but taken exactly, since |x − p| has a kink at p: the rest is smooth. Blocks without
 //! the texture's surface are left out by their middle; where the interpolated value at the middle is off by more than a part of a voxel
 //! of the texture, a block is divided, down to single voxels, which are summed exactly.
 
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
+use smallvec::SmallVec;
 
 use super::OPERATION;
 use super::space::Patch;
 use super::wrap::{Leaves, Made, Solid, block, catmull_rom, radius};
 use crate::error::{EditError, Result};
-use crate::grid::{LEAF_DIM, leaf_origin};
+use crate::grid::{LEAF_DIM, LEAF_VOXELS, leaf_origin};
 use crate::rbf::{Basis, Interpolant};
 use crate::run::RunOptions;
 
@@ -31,10 +33,10 @@ pub struct Rbf {
 /// Spacing of particles in voxels, at least.
 const LEAST_SPACING: f64 = 3.0;
 
-/// Lattice of nodes, as a part of the particles' spacing.
-const NODES: f64 = 0.5;
+/// Lattice of nodes, as a part of the particles' spacing: few nodes, and few particles whose kinks are near.
+const NODES: f64 = 0.7;
 
-/// Largest error of the interpolation, in voxels of the texture.
+/// Largest error of the interpolation in the middle of a block, in voxels of the texture; elsewhere in it it is at most twice that.
 const TOLERANCE: f64 = 0.05;
 
 /// Where the map leads to a place that is farther than this from the one it was asked for, in spacings, it repeats itself.
@@ -98,9 +100,9 @@ impl<'a> Implicit<'a> {
             && self.patch.place(uvw).distance(ijk) < REPEATED * self.spacing
     }
 
-    /// The leaves near the texture's surface, and how often a sum over all particles was taken.
+    /// The leaves near the texture's surface, and how many distances to particles were taken.
     pub fn leaves(&self, solid: &Solid, leaves: Vec<IVec3>, run: &RunOptions) -> Result<(Leaves, u64)> {
-        let mut sums = 0;
+        let (mut sums, particles) = (0, self.particles());
         let mut edge = LEAF_DIM;
         while edge > 2 && f64::from(edge) > NODES * self.spacing {
             edge /= 2;
@@ -116,14 +118,16 @@ impl<'a> Implicit<'a> {
         let voxels = solid.extent() / solid.voxel_size();
         loop {
             let (nodes, taken) = self.nodes(blocks.iter().map(|b| b.0), edge, run)?;
-            sums += taken;
+            sums += taken * particles;
+            let cones = self.cones(edge);
             let tried: Vec<(Block, bool)> = blocks
                 .par_iter()
                 .map(|&(origin, exact)| {
-                    let around = Around::new(&nodes, origin, edge);
-                    let middle = around.at(DVec3::splat(0.5));
+                    let around = Around::new(&nodes, origin, edge, cones.get(&(origin / edge)));
+                    let middle = around.middle();
                     let good = ((middle - exact) * voxels).abs().max_element() < TOLERANCE;
-                    (Block { origin, edge, around: good.then(|| Box::new(around)) }, good)
+                    let held = self.holds(origin.as_dvec3() + f64::from(edge - 1) / 2.0, exact);
+                    (Block { origin, edge, held, around: good.then(|| Box::new(around)) }, good)
                 })
                 .collect();
             let mut rest = Vec::new();
@@ -142,24 +146,45 @@ impl<'a> Implicit<'a> {
             edge /= 2;
             blocks = self.near(solid, &split, edge, &mut sums, run)?;
         }
-        sums += found.iter().filter(|b| b.around.is_none()).map(|b| b.edge.pow(3) as u64).sum::<u64>();
+        let of_block = |b: &Block| {
+            let voxels = b.edge.pow(3) as u64;
+            b.around.as_ref().map_or(voxels * particles, |around| around.cones.len() as u64 * (65 + voxels))
+        };
+        sums += found.iter().map(of_block).sum::<u64>();
         found.par_sort_unstable_by_key(|b| (leaf_origin(b.origin).to_array(), b.origin.to_array()));
         let leaves: Vec<&[Block]> = found.chunk_by(|a, b| leaf_origin(a.origin) == leaf_origin(b.origin)).collect();
         let made = leaves.into_par_iter().map_init(
-            || solid.probe(),
-            |probe, blocks| {
+            || (solid.probe(), [DVec3::ZERO; LEAF_VOXELS]),
+            |(probe, map), blocks| {
                 let origin = leaf_origin(blocks.first()?.origin);
                 let mut made = Made::new(solid);
                 for b in blocks {
-                    for offset in block(b.edge) {
-                        let ijk = (b.origin + offset).as_dvec3();
-                        let uvw = match &b.around {
-                            Some(around) => Some(around.at((offset.as_dvec3() + 0.5) / f64::from(b.edge)))
-                                .filter(|uvw| self.holds(ijk, *uvw)),
-                            None => self.find(ijk),
-                        };
-                        if let Some(uvw) = uvw {
-                            made.set(b.origin - origin + offset, solid.distance(probe, ijk, uvw));
+                    let within = b.origin - origin;
+                    let Some(around) = &b.around else {
+                        for offset in block(b.edge) {
+                            let ijk = (b.origin + offset).as_dvec3();
+                            if let Some(uvw) = self.find(ijk) {
+                                made.set(within + offset, solid.distance(probe, ijk, uvw));
+                            }
+                        }
+                        continue;
+                    };
+                    around.fill(map);
+                    for part in block(b.edge / 2) {
+                        // Halves of a block that the band does not reach.
+                        let first = part * 2;
+                        let at = |o: IVec3| map[((o.x * b.edge + o.y) * b.edge + o.z) as usize];
+                        let middle = (at(first) + at(first + 1)) / 2.0;
+                        let d = solid.distance(probe, (b.origin + first).as_dvec3() + 0.5, middle);
+                        if b.held && d.abs() > radius(2) + solid.half_width() {
+                            made.fill(within + first, 2, d);
+                            continue;
+                        }
+                        for offset in block(2).map(|c| first + c) {
+                            let (ijk, uvw) = ((b.origin + offset).as_dvec3(), at(offset));
+                            if b.held || self.holds(ijk, uvw) {
+                                made.set(within + offset, solid.distance(probe, ijk, uvw));
+                            }
                         }
                     }
                 }
@@ -180,7 +205,7 @@ impl<'a> Implicit<'a> {
         sums: &mut u64,
         run: &RunOptions,
     ) -> Result<Vec<(IVec3, DVec3)>> {
-        *sums += blocks.len() as u64;
+        *sums += blocks.len() as u64 * self.particles();
         let reach = radius(edge) + solid.half_width();
         let near = blocks.par_iter().map_init(
             || solid.probe(),
@@ -199,6 +224,18 @@ impl<'a> Implicit<'a> {
         let near = near.flatten().collect();
         run.check(OPERATION)?;
         Ok(near)
+    }
+
+    /// Of blocks of `edge` voxels (by origin / edge), the cones of particles in and beside them.
+    fn cones(&self, edge: i32) -> FxHashMap<IVec3, Cones> {
+        let mut cones: FxHashMap<IVec3, Cones> = FxHashMap::default();
+        for (p, slope) in self.interpolant.cones() {
+            let own = ((p + 0.5) / f64::from(edge)).floor().as_ivec3();
+            for c in block(3) {
+                cones.entry(own + c - 1).or_default().push((p, slope));
+            }
+        }
+        cones
     }
 
     /// The map at the nodes of a lattice around blocks, and how many those are. Node n is the middle of the voxels from n·edge on.
@@ -230,32 +267,80 @@ impl<'a> Implicit<'a> {
 struct Block {
     origin: IVec3,
     edge: i32,
+    /// Whether the map does not repeat itself in its middle.
+    held: bool,
     around: Option<Box<Around>>,
 }
 
-/// The 4³ nodes around a block.
-struct Around([DVec3; 64]);
+/// Particles whose part a·|x − p| of the sum has its kink nearby: p and a.
+type Cones = SmallVec<[(DVec3, DVec3); 4]>;
+
+/// The 4³ nodes around a block, without the cones.
+struct Around {
+    origin: IVec3,
+    edge: i32,
+    nodes: [DVec3; 64],
+    cones: Cones,
+}
 
 impl Around {
-    fn new(nodes: &FxHashMap<IVec3, DVec3>, origin: IVec3, edge: i32) -> Self {
+    fn new(nodes: &FxHashMap<IVec3, DVec3>, origin: IVec3, edge: i32, cones: Option<&Cones>) -> Self {
         let first = origin / edge - 1;
-        Self(std::array::from_fn(|i| {
-            let c = IVec3::new(i as i32 / 16, i as i32 / 4 % 4, i as i32 % 4);
-            nodes.get(&(first + c)).copied().unwrap_or_default()
-        }))
+        let cones = cones.cloned().unwrap_or_default();
+        let nodes = std::array::from_fn(|i| {
+            let node = first + IVec3::new(i as i32 / 16, i as i32 / 4 % 4, i as i32 % 4);
+            let all = nodes.get(&node).copied().unwrap_or_default();
+            all - sum(&cones, (node * edge).as_dvec3() - 0.5)
+        });
+        Self { origin, edge, nodes, cones }
     }
 
-    /// At `t` in 0..1³ between the inner nodes.
-    fn at(&self, t: DVec3) -> DVec3 {
-        let (x, y, z) = (catmull_rom(t.x), catmull_rom(t.y), catmull_rom(t.z));
-        let mut sum = DVec3::ZERO;
-        for (i, a) in x.iter().enumerate() {
-            for (j, b) in y.iter().enumerate() {
-                let row = &self.0[i * 16 + j * 4..][..4];
-                let along: DVec3 = row.iter().zip(&z).map(|(v, c)| *v * *c).sum();
-                sum += along * (a * b);
+    /// At the middles of the voxels of a block of so many along each axis (z fastest): one axis after the other.
+    fn fill(&self, map: &mut [DVec3; LEAF_VOXELS]) {
+        let (edge, n) = (self.edge, self.edge as usize);
+        let weights: [[f64; 4]; LEAF_DIM as usize] =
+            std::array::from_fn(|i| catmull_rom((i as f64 + 0.5) / f64::from(edge)));
+        let weights = &weights[..n];
+        // Of 4 × 4 × n, then 4 × n × n, then all.
+        let mut along_z = [DVec3::ZERO; 16 * LEAF_DIM as usize];
+        for (row, out) in self.nodes.chunks_exact(4).zip(along_z.chunks_exact_mut(n)) {
+            for (w, out) in weights.iter().zip(out) {
+                *out = row[0] * w[0] + row[1] * w[1] + row[2] * w[2] + row[3] * w[3];
             }
         }
-        sum
+        let mut along_y = [DVec3::ZERO; 4 * (LEAF_DIM * LEAF_DIM) as usize];
+        for (slab, out) in along_z.chunks_exact(4 * n).zip(along_y.chunks_exact_mut(n * n)) {
+            for (w, out) in weights.iter().zip(out.chunks_exact_mut(n)) {
+                for (z, out) in out.iter_mut().enumerate() {
+                    *out = slab[z] * w[0] + slab[n + z] * w[1] + slab[2 * n + z] * w[2] + slab[3 * n + z] * w[3];
+                }
+            }
+        }
+        let m = n * n;
+        for (w, out) in weights.iter().zip(map.chunks_exact_mut(m)) {
+            for (yz, out) in out.iter_mut().enumerate() {
+                *out = along_y[yz] * w[0]
+                    + along_y[m + yz] * w[1]
+                    + along_y[2 * m + yz] * w[2]
+                    + along_y[3 * m + yz] * w[3];
+            }
+        }
+        if !self.cones.is_empty() {
+            for (offset, value) in block(edge).zip(map) {
+                *value += sum(&self.cones, (self.origin + offset).as_dvec3());
+            }
+        }
     }
+
+    /// In the middle.
+    fn middle(&self) -> DVec3 {
+        let weights = catmull_rom(0.5);
+        let at = |i: usize| weights[i / 16] * weights[i / 4 % 4] * weights[i % 4];
+        let smooth: DVec3 = self.nodes.iter().enumerate().map(|(i, v)| *v * at(i)).sum();
+        smooth + sum(&self.cones, self.origin.as_dvec3() + f64::from(self.edge - 1) / 2.0)
+    }
+}
+
+fn sum(cones: &Cones, x: DVec3) -> DVec3 {
+    cones.iter().map(|(p, slope)| *slope * p.distance(x)).sum()
 }

@@ -2,7 +2,7 @@
 
 use glam::{DVec3, IVec3};
 
-use crate::levelset::{LevelSet, Sampler};
+use super::field::{Field, Lookup};
 
 /// Newton steps, and how near the level they end, in voxels (Brodersen et al. 2007).
 const STEPS: usize = 10;
@@ -14,54 +14,53 @@ const FLAT_SQUARED: f64 = 0.01;
 /// The surface φ = c. Positions and c are in voxels of the field.
 #[derive(Clone, Copy)]
 pub(super) struct Level<'a> {
-    field: &'a LevelSet,
+    field: &'a Field,
     height: f64,
 }
 
 impl<'a> Level<'a> {
     /// The surface `height` voxels outside the zero set. The band must hold it.
-    pub fn new(field: &'a LevelSet, height: f64) -> Self {
+    pub fn new(field: &'a Field, height: f64) -> Self {
         Self { field, height }
     }
 
     /// The point of the level that belongs to a place that may lie far from it: by the gradient where there is one, else from the nearest
     /// voxel beside the level.
     pub fn reach(&self, probe: &mut Probe, x: DVec3) -> Option<DVec3> {
-        probe.project(x).or_else(|| probe.project(nearest_voxel(self.field, self.height, x)?))
+        probe.project(x).or_else(|| probe.project(self.field.nearest_node(self.height, x)?))
     }
 
     /// Looks points up, one after the other.
     pub fn probe(&self) -> Probe<'a> {
-        Probe { sampler: self.field.sampler(), voxel_size: self.field.voxel_size(), height: self.height }
+        Probe { field: self.field.lookup(), height: self.height }
     }
 }
 
 /// A level and the place in the grid that was looked at last.
 pub(super) struct Probe<'a> {
-    sampler: Sampler<'a>,
-    voxel_size: f64,
+    field: Lookup<'a>,
     height: f64,
 }
 
 impl Probe<'_> {
     /// Voxels above the level.
     pub fn above(&mut self, x: DVec3) -> f64 {
-        f64::from(self.sampler.trilinear(x)) / self.voxel_size - self.height
+        self.field.value(x) - self.height
     }
 
     /// The unit normal of the level through `x`, by central differences over a voxel; `None` where there is none.
     pub fn normal(&mut self, x: DVec3) -> Option<DVec3> {
-        let gradient = self.sampler.smooth_gradient(x);
+        let gradient = self.field.smooth_gradient(x);
         (gradient.length_squared() > FLAT_SQUARED).then(|| gradient.normalize())
     }
 
     /// The point of the level by `x`, by x ← x − (φ − c) ∇φ/|∇φ|²; where the field is not smooth, the nearest crossing of
-    /// an edge of the grid. `None` where there is no surface within two voxels of where the iteration ends.
+    /// an edge of the grid. `None` where there is no surface within two voxels of the lattice of where the iteration ends.
     pub fn project(&mut self, x: DVec3) -> Option<DVec3> {
         let mut at = x;
         for _ in 0..STEPS {
-            let (phi, gradient) = self.sampler.value_and_gradient(at);
-            let above = f64::from(phi) / self.voxel_size - self.height;
+            let (phi, gradient) = self.field.value_and_gradient(at);
+            let above = phi - self.height;
             if above.abs() < NEAR_ENOUGH {
                 return Some(at);
             }
@@ -81,15 +80,17 @@ impl Probe<'_> {
         if !x.is_finite() || x.abs().max_element() > f64::from(crate::grid::MAX_COORD - 4) {
             return None;
         }
-        let base = x.floor().as_ivec3();
+        let (origin, edge) = self.field.lattice(self.height);
+        let place = |voxel: IVec3| origin + voxel.as_dvec3() * edge;
+        let base = ((x - origin) / edge).floor().as_ivec3();
         let mut best: Option<(f64, DVec3)> = None;
         for i in 0..6 * 6 * 6 {
             let voxel = base + IVec3::new(i / 36 - 2, i / 6 % 6 - 2, i % 6 - 2);
-            let a = self.at_voxel(voxel);
+            let a = self.above(place(voxel));
             for axis in [IVec3::X, IVec3::Y, IVec3::Z] {
-                let b = self.at_voxel(voxel + axis);
+                let b = self.above(place(voxel + axis));
                 if (a < 0.0) != (b < 0.0) {
-                    let p = voxel.as_dvec3() + axis.as_dvec3() * (a / (a - b));
+                    let p = place(voxel) + axis.as_dvec3() * (edge * a / (a - b));
                     let d = p.distance_squared(x);
                     if best.is_none_or(|(least, _)| d < least) {
                         best = Some((d, p));
@@ -99,42 +100,17 @@ impl Probe<'_> {
         }
         best.map(|(_, p)| p)
     }
-
-    fn at_voxel(&mut self, ijk: IVec3) -> f64 {
-        f64::from(self.sampler.voxel(ijk)) / self.voxel_size - self.height
-    }
-}
-
-/// The active voxel beside the surface φ = `height` (in voxels) that is nearest to `x`.
-fn nearest_voxel(field: &LevelSet, height: f64, x: DVec3) -> Option<DVec3> {
-    let (grid, h) = (field.grid(), field.voxel_size());
-    let nearest = grid.map_leaves(|id| {
-        let origin = grid.origin(id);
-        let mut best: Option<(f64, IVec3)> = None;
-        for offset in grid.mask(id).iter() {
-            if (f64::from(grid.values(id).0[offset]) / h - height).abs() >= 1.0 {
-                continue;
-            }
-            let ijk = origin + crate::grid::offset_to_local(offset);
-            let d = ijk.as_dvec3().distance_squared(x);
-            if best.is_none_or(|(least, _)| d < least) {
-                best = Some((d, ijk));
-            }
-        }
-        best
-    });
-    let (_, ijk) = nearest.into_iter().flatten().reduce(|a, b| if b.0 < a.0 { b } else { a })?;
-    Some(ijk.as_dvec3())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::levelset::LevelSet;
     use crate::levelset::testing::{ball, box_distance, sampled};
 
     #[test]
     fn points_come_back_to_the_level() {
-        let ball = ball(DVec3::new(0.2, 0.1, 0.0), 12.0);
+        let ball = Field::around(&ball(DVec3::new(0.2, 0.1, 0.0), 12.0), 8.0);
         let mut probe = Level::new(&ball, 1.0).probe();
         for direction in [DVec3::X, DVec3::new(1.0, 2.0, -3.0).normalize(), DVec3::new(-1.0, 0.1, 0.1).normalize()] {
             let centre = DVec3::new(0.2, 0.1, 0.0);
@@ -143,20 +119,20 @@ mod tests {
             assert!((p.distance(centre) - 13.0).abs() < 0.03 && probe.above(p).abs() < 1e-3);
             assert!((probe.normal(p).unwrap() - direction).length() < 0.02);
         }
-        assert!(probe.project(DVec3::ZERO).is_none() && probe.project(DVec3::splat(1e300)).is_none());
+        assert!(probe.project(DVec3::splat(1e300)).is_none());
     }
 
     #[test]
     fn a_point_by_a_sharp_corner_or_far_away_finds_the_surface() {
         let half = DVec3::new(9.3, 9.3, 9.3);
-        let cube = sampled(14, move |p| box_distance(p, half));
+        let cube = Field::around(&sampled(14, move |p| box_distance(p, half)), 8.0);
         let mut probe = Level::new(&cube, 0.0).probe();
         let p = probe.project(DVec3::splat(9.0)).unwrap();
         assert!(box_distance(p, half).abs() < 0.5, "{p}");
         let level = Level::new(&cube, 0.0);
         let far = level.reach(&mut probe, DVec3::new(60.0, 1.0, 2.0)).unwrap();
         assert!((far - DVec3::new(9.3, 1.0, 2.0)).length() < 0.01, "{far}");
-        let empty = LevelSet::empty(crate::grid::Transform::uniform(1.0), 3.0);
+        let empty = Field::around(&LevelSet::empty(crate::grid::Transform::uniform(1.0), 3.0), 8.0);
         let level = Level::new(&empty, 0.0);
         assert!(level.reach(&mut level.probe(), DVec3::ZERO).is_none());
     }

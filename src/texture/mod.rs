@@ -5,6 +5,7 @@
 //! or by radial basis functions (`implicit`).
 
 mod cells;
+mod field;
 mod implicit;
 mod level;
 mod patch;

@@ -3,13 +3,16 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::field::Field;
 use super::level::Level;
 use super::path::{geodesic, length, resampled};
 use crate::error::EditError;
-use crate::levelset::LevelSet;
 
 /// Cells along an edge, at least and at most.
 const CELLS: [usize; 2] = [4, 64];
+
+/// Points along a geodesic are no closer than this part of its length: every other one becomes a point of the net.
+const FINEST: f64 = 2.0 * CELLS[1] as f64;
 
 /// Cells along the longer edge of the coarsest net.
 const COARSEST: usize = 12;
@@ -21,6 +24,10 @@ const DIAGONAL: f64 = 0.25;
 const COARSE_SWEEPS: usize = 500;
 const SWEEPS: usize = 60;
 const REST: f64 = 1e-3;
+
+/// Part of the cells of a patch that may fold over, and how much longer than the mean one a cell may be.
+const SLIVERS: f64 = 0.02;
+const TORN: f64 = 8.0;
 
 /// Neighbouring corners whose normals differ by more than this see opposite sides of the surface.
 const OPPOSITE: f64 = 150.0;
@@ -64,6 +71,33 @@ impl Net {
         [length(&bottom), length(&left)]
     }
 
+    /// What is wrong with it as a piece of a surface: cells that turn away from the side that most of them face, or that are much longer than the others, as
+    /// where it is spanned across a hole.
+    pub(super) fn flaw(&self) -> Option<&'static str> {
+        let [nu, nv] = self.counts;
+        let (mut areas, mut longest) = (Vec::with_capacity(nu * nv), 0.0f64);
+        for i in 0..nu {
+            for j in 0..nv {
+                let (along, across) = (self.at(i + 1, j) - self.at(i, j), self.at(i, j + 1) - self.at(i, j));
+                longest = longest.max(along.length()).max(across.length());
+                let other = (self.at(i + 1, j + 1) - self.at(i, j + 1), self.at(i + 1, j + 1) - self.at(i + 1, j));
+                areas.push((along.cross(across), other.0.cross(other.1)));
+            }
+        }
+        // Both corners of a cell see one side, but for a few slivers in creases.
+        let turned = areas.iter().filter(|(a, b)| a.dot(*b) <= 0.0).count();
+        if turned as f64 > SLIVERS * areas.len() as f64 {
+            return Some("the patch folds over");
+        }
+        (longest > TORN * self.spacing().max(1.0)).then_some("the patch is torn, as across a hole")
+    }
+
+    /// Mean length of the cells along the first sides.
+    pub fn spacing(&self) -> f64 {
+        let ([a, b], [nu, nv]) = (self.edges(), self.counts);
+        (a / nu as f64 + b / nv as f64) / 2.0
+    }
+
     /// The point at (u, v), bilinear in its cell; beyond 0..1 the cells at the border go on.
     pub fn bilinear(&self, u: f64, v: f64) -> DVec3 {
         let [nu, nv] = self.counts;
@@ -81,7 +115,7 @@ impl Net {
 /// Corners of a patch brought to the surface and verified. Positions in voxels, which see the world `mirrored` or not; the error names the corner and
 /// what to change.
 pub(super) fn corners_on_surface(
-    field: &LevelSet,
+    field: &Field,
     corners: [DVec3; 4],
     reach: f64,
     mirrored: bool,
@@ -130,7 +164,8 @@ pub(super) fn patch(level: Level, corners: [DVec3; 4], spacing: f64, begin: Opti
     let [p1, p2, p3, p4] = corners;
     let ends = [(p1, p2), (p4, p3), (p1, p4), (p2, p3)];
     let first = begin.map_or_else(Default::default, Net::sides);
-    let fine = spacing.min(1.0);
+    let longest = ends.iter().map(|(a, b)| a.distance(*b)).fold(0.0, f64::max);
+    let fine = spacing.min(1.0).max(longest / FINEST);
     let sides: Vec<Vec<DVec3>> = (0..4)
         .into_par_iter()
         .map(|k| geodesic(level, inner(&first[k]), ends[k].0, ends[k].1, fine))
@@ -242,10 +277,14 @@ pub(super) fn broken(operation: &str) -> EditError {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::levelset::testing::{ball, sampled, torus};
+    use crate::levelset::testing;
 
-    fn plane() -> LevelSet {
-        sampled(24, |p| p.z - 0.3)
+    fn ball(radius: f64) -> Field {
+        Field::around(&testing::ball(DVec3::ZERO, radius), 8.0)
+    }
+
+    fn plane() -> Field {
+        Field::around(&testing::sampled(24, |p| p.z - 0.3), 8.0)
     }
 
     const SQUARE: [DVec3; 4] = [
@@ -273,7 +312,7 @@ mod tests {
 
     #[test]
     fn a_ball_has_an_even_net() {
-        let ball = ball(DVec3::ZERO, 20.0);
+        let ball = ball(20.0);
         let at = |x: f64, y: f64| DVec3::new(x, y, 1.0).normalize() * 20.0;
         let corners = [at(-0.5, -0.5), at(0.5, -0.5), at(0.5, 0.5), at(-0.5, 0.5)];
         let net = patch(Level::new(&ball, 0.0), corners, 2.0, None).unwrap();
@@ -292,7 +331,7 @@ mod tests {
 
     #[test]
     fn corners_that_cannot_work_are_named() {
-        let ball = ball(DVec3::ZERO, 20.0);
+        let ball = ball(20.0);
         let at = |x: f64, y: f64, z: f64| DVec3::new(x, y, z).normalize() * 20.0;
         let good = [at(-0.5, -0.5, 1.0), at(0.5, -0.5, 1.0), at(0.5, 0.5, 1.0), at(-0.5, 0.5, 1.0)];
         assert!(corners_on_surface(&ball, good, 10.0, false).is_ok());
@@ -306,7 +345,7 @@ mod tests {
 
     #[test]
     fn a_torus_patch_across_the_inner_rim() {
-        let torus = torus(20.0, 8.0);
+        let torus = Field::around(&testing::torus(20.0, 8.0), 8.0);
         let at = |u: f64, v: f64| {
             DVec3::new((20.0 + 8.0 * v.cos()) * u.cos(), (20.0 + 8.0 * v.cos()) * u.sin(), 8.0 * v.sin())
         };

@@ -177,13 +177,18 @@ fn project_inner(probe: &mut Probe, path: &mut [DVec3]) -> Option<()> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::field::Field;
     use super::*;
-    use crate::levelset::testing::{ball, torus};
+    use crate::levelset::testing;
+
+    fn torus(major: f64, minor: f64) -> Field {
+        Field::around(&testing::torus(major, minor), 8.0)
+    }
 
     #[test]
     fn great_circles() {
         let radius = 20.0;
-        let ball = ball(DVec3::ZERO, radius);
+        let ball = Field::around(&testing::ball(DVec3::ZERO, radius), 8.0);
         for degrees in [30.0, 90.0, 150.0, 175.0] {
             let angle = f64::to_radians(degrees);
             let (a, b) = (DVec3::X * radius, DVec3::new(angle.cos(), 0.6 * angle.sin(), 0.8 * angle.sin()) * radius);

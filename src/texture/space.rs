@@ -1,18 +1,19 @@
 //! A patch with the space above it.
 
 use std::fmt::Write as _;
+use std::sync::OnceLock;
 
-use glam::{DVec3, IVec3};
+use glam::DVec3;
 
 use super::OPERATION;
 use super::cells::{Cells, Distortion};
+use super::field::{ABOVE, Field, GROUND};
 use super::level::Level;
 use super::patch::{Net, broken, corners_on_surface, patch};
 use super::volume::{Heights, Volume};
 use crate::error::{EditError, Result};
 use crate::grid::MAX_COORD;
 use crate::levelset::LevelSet;
-use crate::mesh::widened;
 use crate::run::RunOptions;
 
 /// Spacing of particles along the patch and across it, in voxels.
@@ -28,6 +29,13 @@ const LARGEST: f64 = 4000.0;
 /// How far below the surface (or above it, if the height goes down) the space goes on, in voxels beyond the half width of the band.
 const BEYOND: f64 = 2.0;
 
+/// Space around what is expected to hold the particles, in voxels; and as a part of the height, where they are pushed aside.
+const MARGIN: f64 = 8.0;
+const ASIDE: f64 = 0.5;
+
+/// How far a corner is expected to go along its direction, in heights.
+const STEEPEST: f64 = 3.0;
+
 /// How particles are distributed above a patch.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Parameterization {
@@ -42,7 +50,7 @@ pub enum Parameterization {
 /// A patch of a surface with the space above it, and the map from (u, v, w) in 0..1³ into that.
 pub struct Patch {
     pub(super) volume: Volume,
-    pub(super) cells: Cells,
+    cells: OnceLock<Cells>,
     /// Lengths of the edges p1p2 and p1p4 and the height, in voxels.
     lengths: DVec3,
     /// Whether the space is outside of the surface.
@@ -75,10 +83,16 @@ impl Patch {
         }
         let reach = (CORNER_REACH * longest).max(LEAST_CORNER_REACH);
         let handed = transform.to_world().matrix3.determinant() < 0.0;
-        let corners = corners_on_surface(base, corners, reach, handed).map_err(refuse)?;
-        let space = Space::around(base, &corners, longest / 2.0, height, parameterization, run)?;
-        let net = patch(Level::new(&space.field, 0.0), corners, SPACING, None).ok_or_else(|| broken(OPERATION))?;
-        space.patch(net, parameterization, run)
+        // As far as the edges may leave the plane of the corners.
+        let around = longest / 2.0 + MARGIN;
+        let ground = Field::new(base, bounds(&corners, around, "corners")?, 0.0, GROUND, run)?;
+        let corners = corners_on_surface(&ground, corners, reach, handed).map_err(refuse)?;
+        let net = patch(Level::new(&ground, 0.0), corners, SPACING, None).ok_or_else(|| broken(OPERATION))?;
+        if let Some(flaw) = net.flaw() {
+            let accepted = "corners on one smooth piece of the surface, without a hole or a fold between them";
+            return Err(refuse(format!("{accepted}: {flaw}")));
+        }
+        Self::over(base, net, height, parameterization, run)
     }
 
     /// Over a net of points on the surface of `base`.
@@ -89,12 +103,17 @@ impl Patch {
         parameterization: &Parameterization,
         run: &RunOptions,
     ) -> Result<Self> {
-        Space::around(base, &net.points, 0.0, height, parameterization, run)?.patch(net, parameterization, run)
+        Space::around(base, &net, height, parameterization, run)?.patch(net, parameterization, run)
+    }
+
+    /// Made when they are first asked for: the semi-implicit map does without.
+    pub(super) fn cells(&self) -> &Cells {
+        self.cells.get_or_init(|| Cells::new(&self.volume))
     }
 
     /// Distortion of the map from a texture of this patch's edge lengths and height.
     pub fn distortion(&self) -> Distortion {
-        self.cells.distortion(self.lengths)
+        self.cells().distortion(self.lengths)
     }
 
     /// Lengths of the edges p1p2 and p1p4 and the height, in voxels.
@@ -110,7 +129,7 @@ impl Patch {
     /// (u, v, w) of a place in voxels, the exact inverse of [`place`](Self::place); `None` outside the space above the patch. w goes on a few
     /// voxels beyond the surface.
     pub fn find(&self, ijk: DVec3) -> Option<DVec3> {
-        self.cells.finder().find(ijk)
+        self.cells().finder().find(ijk)
     }
 
     /// The particles, in voxels, with their (u, v, w), and the edges between them.
@@ -143,18 +162,17 @@ pub struct Particles {
 
 /// The distance field around a patch that is to be.
 struct Space {
-    field: LevelSet,
+    field: Field,
     /// In voxels, negative downwards.
     height: f64,
     depth: f64,
 }
 
 impl Space {
-    /// Around `points` (in voxels) and as much more, as far as the height.
+    /// Around a net (in voxels), as far as the height.
     fn around(
         base: &LevelSet,
-        points: &[DVec3],
-        more: f64,
+        net: &Net,
         height: f64,
         parameterization: &Parameterization,
         run: &RunOptions,
@@ -166,17 +184,21 @@ impl Space {
             let accepted = format!("{h} to {} (1 to {LARGEST} voxels), or as much downwards", LARGEST * h);
             return Err(EditError::parameter(OPERATION, "height", height, accepted));
         }
-        let around = voxels.abs() + more + 8.0;
-        let lo = points.iter().copied().fold(DVec3::INFINITY, DVec3::min) - around;
-        let hi = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max) + around;
-        let farthest = lo.abs().max(hi.abs()).max_element();
-        if !farthest.is_finite() || farthest > f64::from(MAX_COORD) {
-            let accepted = "a place within 2^30 voxels of the origin";
-            return Err(EditError::parameter(OPERATION, "corners", format!("{lo} to {hi}, in voxels"), accepted));
+        // Where the particles go if nothing is in their way.
+        let mut sampler = base.sampler();
+        let mut points = net.points.clone();
+        for p in &net.points {
+            let normal = sampler.smooth_gradient(*p).normalize_or_zero();
+            points.extend([*p + normal * voxels, *p - normal * (depth * voxels.signum())]);
         }
-        let wanted = |first: IVec3, last: IVec3| first.as_dvec3().cmple(hi).all() && last.as_dvec3().cmpge(lo).all();
-        let field = widened(base, (voxels.abs().max(depth) + 3.0) as f32, wanted, run)?;
-        run.check(OPERATION)?;
+        if let Parameterization::LowDistortion(Some(directions)) = parameterization {
+            let to_index = base.transform().to_index().matrix3;
+            for (p, d) in net.corners().into_iter().zip(directions) {
+                points.push(p + (to_index * *d).normalize_or_zero() * (voxels * STEEPEST));
+            }
+        }
+        let bounds = bounds(&points, voxels.abs() * ASIDE + MARGIN, "corners")?;
+        let field = Field::new(base, bounds, voxels.abs() * ASIDE, ABOVE, run)?;
         Ok(Self { field, height: voxels, depth })
     }
 
@@ -186,7 +208,7 @@ impl Space {
         let [bottom, left] = net.edges();
         let mut lengths = DVec3::new(bottom, left, height.abs());
         let of = if height > 0.0 { Heights::raised } else { Heights::sunk };
-        let heights = of(height.abs(), depth, SPACING);
+        let heights = of(height.abs(), depth, net.spacing().max(SPACING));
         let volume = match parameterization {
             Parameterization::Conforming => Volume::conforming(&field, net, &heights),
             Parameterization::LowDistortion(directions) => {
@@ -216,9 +238,20 @@ impl Space {
             }
         };
         run.check(OPERATION)?;
-        let cells = Cells::new(&volume);
-        Ok(Patch { volume, cells, lengths, raised: height > 0.0, depth })
+        Ok(Patch { volume, cells: OnceLock::new(), lengths, raised: height > 0.0, depth })
     }
+}
+
+/// The box around points and so much more; refused where it is too far away for voxels.
+fn bounds(points: &[DVec3], more: f64, what: &str) -> Result<(DVec3, DVec3)> {
+    let lo = points.iter().copied().fold(DVec3::INFINITY, DVec3::min) - more;
+    let hi = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max) + more;
+    let farthest = lo.abs().max(hi.abs()).max_element();
+    if !farthest.is_finite() || farthest > f64::from(MAX_COORD) {
+        let accepted = "a place within 2^30 voxels of the origin";
+        return Err(EditError::parameter(OPERATION, what, format!("{lo} to {hi}, in voxels"), accepted));
+    }
+    Ok((lo, hi))
 }
 
 /// Part of the way to the first point of a spline along which it goes with the normal.

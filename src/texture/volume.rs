@@ -3,26 +3,34 @@
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
+use super::field::Field;
 use super::level::Level;
 use super::patch::{Net, patch};
-use crate::levelset::LevelSet;
 use crate::mesh::{Spline, double_reflection};
 
-/// Largest step of a particle, in voxels.
+/// Largest step of a particle, in voxels of the lattice that it is in, and the height up to which that is the base's.
 const STEP: f64 = 0.5;
+const NEAR: f64 = 3.0;
 
 /// Most layers above the surface.
 const MOST_LAYERS: usize = 48;
 
 /// Most levels that get a net of their own, and most sections along a spline.
 const MOST_NETS: usize = 12;
-const MOST_SECTIONS: usize = 96;
+const MOST_SECTIONS: usize = 192;
 
 /// Pieces that a spline is cut into between two points for its length, frames and curvature.
 const PIECES: usize = 64;
 
 /// Part of the radius of curvature of a spline that its sections may reach to: at 1 particles would run backwards.
 const WITHIN_BEND: f64 = 0.9;
+
+/// Angle (radians) that a spline turns by between two sections at most, as far as their number allows.
+const TURN: f64 = 0.1;
+
+/// How often sections that fold are drawn together further, and to what part of their width each time.
+const MOST_ROUNDS: usize = 40;
+const NARROWER: f64 = 0.85;
 
 /// A direction that rises less than this with the surface is along it.
 const LEAST_SLOPE: f64 = 0.1;
@@ -100,7 +108,7 @@ fn even(height: f64, spacing: f64) -> Vec<f64> {
 impl Volume {
     /// Over `base`, on the levels of the field: each particle follows ∇φ. The band must reach two voxels beyond the levels. Particles keep
     /// their neighbours at every height, so cells widen over convex parts and narrow over concave ones.
-    pub fn conforming(field: &LevelSet, base: Net, heights: &Heights) -> Self {
+    pub fn conforming(field: &Field, base: Net, heights: &Heights) -> Self {
         let nets = |levels: &[f64]| {
             let climbed = |p: &DVec3| climb(field, *p, levels, None);
             let paths: Vec<Vec<DVec3>> = base.points.par_iter().map(climbed).collect();
@@ -114,7 +122,7 @@ impl Volume {
     /// As [`conforming`](Self::conforming), but only the corners climb, along `directions` if there are any; between them each level gets a
     /// net of its own, so that cells stay even. `None` where a level cannot be spanned.
     pub fn low_distortion(
-        field: &LevelSet,
+        field: &Field,
         base: Net,
         heights: &Heights,
         spacing: f64,
@@ -138,7 +146,7 @@ impl Volume {
     /// by frames that turn as little as can be, and drawn together where the curve bends so much that they would meet. w is the part of the curve's
     /// length. A layer `depth` under the base follows the field. Returns the length of the curve as well.
     pub fn along_spline(
-        field: &LevelSet,
+        field: &Field,
         base: Net,
         points: &[DVec3],
         normal: DVec3,
@@ -147,32 +155,32 @@ impl Volume {
     ) -> (Self, f64) {
         let curve = Spline::through(points);
         // Point, tangent and length so far.
-        let (mut places, mut lengths, mut length) = (vec![curve.at(0, 0.0)], vec![0.0], 0.0);
+        let (mut curve_places, mut lengths, mut length) = (vec![curve.at(0, 0.0)], vec![0.0], 0.0);
         for i in 0..curve.pieces() {
             for k in 1..=PIECES {
                 let place = curve.at(i, k as f64 / PIECES as f64);
-                length += place.0.distance(places[places.len() - 1].0);
-                places.push(place);
+                length += place.0.distance(curve_places[curve_places.len() - 1].0);
+                curve_places.push(place);
                 lengths.push(length);
             }
         }
-        let tangent = places[0].1;
+        let tangent = curve_places[0].1;
         let across = tangent.any_orthonormal_vector();
         let first = DMat3::from_cols(across, tangent.cross(across), tangent);
         let mut frames = vec![first];
-        for w in places.windows(2) {
+        for w in curve_places.windows(2) {
             frames.push(double_reflection(&frames[frames.len() - 1], w[0], w[1]));
         }
         // The base stands across the normal, the sections across the curve.
         let upright = DMat3::from_quat(DQuat::from_rotation_arc(normal, tangent));
-        let start = places[0].0;
+        let start = curve_places[0].0;
         let local: Vec<DVec3> = base.points.iter().map(|p| first.transpose() * (upright * (*p - start))).collect();
         // κ N by differences, in each frame.
-        let n = places.len();
+        let n = curve_places.len();
         let bends: Vec<DVec3> = (0..n)
             .map(|k| {
                 let (a, b) = (k.saturating_sub(1), (k + 1).min(n - 1));
-                frames[k].transpose() * (places[b].1 - places[a].1) / (lengths[b] - lengths[a]).max(1e-12)
+                frames[k].transpose() * (curve_places[b].1 - curve_places[a].1) / (lengths[b] - lengths[a]).max(1e-12)
             })
             .collect();
         let allowed: Vec<f64> = bends
@@ -182,34 +190,45 @@ impl Volume {
                 if reach > WITHIN_BEND { WITHIN_BEND / reach } else { 1.0 }
             })
             .collect();
-        let widths =
-            drawn_together(&allowed, &lengths, local.iter().map(|p| p.truncate().length()).fold(0.0, f64::max));
-        let count = ((length / spacing).ceil() as usize).clamp(4, MOST_SECTIONS);
-        let mut sections = Vec::with_capacity(count);
-        let mut at = 0;
-        for k in 1..=count {
-            let s = length * k as f64 / count as f64;
-            while at + 2 < n && lengths[at + 1] < s {
-                at += 1;
-            }
-            let t = ((s - lengths[at]) / (lengths[at + 1] - lengths[at]).max(1e-12)).clamp(0.0, 1.0);
-            let place = |j: usize| {
-                // The base's relief fades along the curve: sections become plane.
-                let size = DVec3::new(widths[j], widths[j], (1.0 - lengths[j] / length).max(0.0));
-                let (point, frame) = (places[j].0, frames[j]);
-                local.iter().map(|p| point + frame * (*p * size)).collect::<Vec<_>>()
+        let reach = local.iter().map(|p| p.truncate().length()).fold(0.0, f64::max);
+        let places = section_places(&bends, &lengths, spacing);
+        let sections = |widths: &[f64]| -> Vec<Net> {
+            let section = |&(at, t): &(usize, f64)| {
+                let place = |j: usize| {
+                    // The base's relief fades along the curve: sections become plane.
+                    let size = DVec3::new(1.0, 1.0, (1.0 - lengths[j] / length).max(0.0)) * widths[j];
+                    let (point, frame) = (curve_places[j].0, frames[j]);
+                    local.iter().map(|p| point + frame * (*p * size)).collect::<Vec<_>>()
+                };
+                let points = place(at).into_iter().zip(place(at + 1)).map(|(p, q)| p.lerp(q, t)).collect();
+                Net { counts: base.counts, points }
             };
-            let points = place(at).into_iter().zip(place(at + 1)).map(|(p, q)| p.lerp(q, t)).collect();
-            sections.push(Net { counts: base.counts, points });
+            places.iter().map(section).collect()
+        };
+        // What holds for the curve need not for its sections, which are apart: where cells between two of them fold all the same, both are drawn together
+        // further.
+        let [p1, p2, _, p4] = base.corners();
+        let hand = (p2 - p1).cross(p4 - p1).dot(normal);
+        let mut allowed = allowed;
+        let mut made = sections(&drawn_together(&allowed, &lengths, reach));
+        for _ in 0..MOST_ROUNDS {
+            let below = |k: usize| if k == 0 { &base } else { &made[k - 1] };
+            let folded: Vec<usize> = (0..made.len()).filter(|&k| folds(below(k), &made[k], hand)).collect();
+            if folded.is_empty() {
+                break;
+            }
+            for k in folded {
+                let (from, to) = (if k == 0 { 0 } else { places[k - 1].0 }, (places[k].0 + 1).min(n - 1));
+                allowed[from..=to].iter_mut().for_each(|width| *width *= NARROWER);
+            }
+            made = sections(&drawn_together(&allowed, &lengths, reach));
         }
+        let heights_of = |&(at, t): &(usize, f64)| lengths[at] + (lengths[at + 1] - lengths[at]) * t;
+        let above: Vec<f64> = places.iter().map(heights_of).collect();
         let under = |p: &DVec3| climb(field, *p, &[-depth], None)[0];
         let below = Net { counts: base.counts, points: base.points.par_iter().map(under).collect() };
-        let heights = Heights {
-            below: vec![-depth],
-            above: (1..=count).map(|k| length * k as f64 / count as f64).collect(),
-            texture: [0.0, length],
-        };
-        (heights.volume(vec![below], base, sections), length)
+        let heights = Heights { below: vec![-depth], above, texture: [0.0, length] };
+        (heights.volume(vec![below], base, made), length)
     }
 
     /// The map from texture space: bilinear on the two layers around w, linear between them.
@@ -219,6 +238,43 @@ impl Volume {
         let t = ((uvw.z - low) / (high - low)).clamp(0.0, 1.0);
         self.layers[above - 1].bilinear(uvw.x, uvw.y).lerp(self.layers[above].bilinear(uvw.x, uvw.y), t)
     }
+}
+
+/// Where the sections of a curve are: the place before each, and the part of the way to the next. They are `spacing` apart, less where it bends; the last one is
+/// at the end.
+fn section_places(bends: &[DVec3], lengths: &[f64], spacing: f64) -> Vec<(usize, f64)> {
+    let n = lengths.len();
+    let mut so_far = vec![0.0];
+    for k in 1..n {
+        let bend = (bends[k - 1].length() + bends[k].length()) / 2.0;
+        so_far.push(so_far[k - 1] + (lengths[k] - lengths[k - 1]) * (1.0 / spacing).max(bend / TURN));
+    }
+    let count = (so_far[n - 1].ceil() as usize).clamp(4, MOST_SECTIONS);
+    let mut at = 0;
+    let place = |k: usize| {
+        let s = so_far[n - 1] * k as f64 / count as f64;
+        while at + 2 < n && so_far[at + 1] < s {
+            at += 1;
+        }
+        (at, ((s - so_far[at]) / (so_far[at + 1] - so_far[at]).max(1e-12)).clamp(0.0, 1.0))
+    };
+    (1..=count).map(place).collect()
+}
+
+/// Whether a cell between two nets of equal counts folds: its Jacobian has not the sign of `hand` at a corner.
+fn folds(low: &Net, high: &Net, hand: f64) -> bool {
+    let [nu, nv] = low.counts;
+    (0..nu * nv).any(|cell| {
+        let (i, j) = (cell / nv, cell % nv);
+        let corner = |u: usize, v: usize, w: usize| [low, high][w].at(i + u, j + v);
+        (0..8).any(|c| {
+            let [u, v, w] = [c >> 2, c >> 1 & 1, c & 1];
+            let by_u = corner(1, v, w) - corner(0, v, w);
+            let by_v = corner(u, 1, w) - corner(u, 0, w);
+            let by_w = corner(u, v, 1) - corner(u, v, 0);
+            by_u.cross(by_v).dot(by_w) * hand <= 0.0
+        })
+    })
 }
 
 /// Widths (0..1) of the sections along a curve that are nowhere more than `allowed`, and change by as much as the curve goes on over `reach` at most.
@@ -235,7 +291,7 @@ fn drawn_together(allowed: &[f64], lengths: &[f64], reach: f64) -> Vec<f64> {
 }
 
 /// The places of a particle of the surface on levels that begin at 0 and rise, or fall, along ∇φ or a direction. It stays where the field has no slope.
-fn climb(field: &LevelSet, from: DVec3, levels: &[f64], direction: Option<DVec3>) -> Vec<DVec3> {
+fn climb(field: &Field, from: DVec3, levels: &[f64], direction: Option<DVec3>) -> Vec<DVec3> {
     let mut probe = Level::new(field, 0.0).probe();
     // dx/dc for the level c: unit speed through the levels.
     let mut velocity = |x: DVec3| {
@@ -250,9 +306,10 @@ fn climb(field: &LevelSet, from: DVec3, levels: &[f64], direction: Option<DVec3>
     };
     let mut settle = Level::new(field, 0.0).probe();
     let mut path = Vec::with_capacity(levels.len());
-    let (mut x, mut c) = (from, 0.0);
+    let (mut x, mut c) = (from, 0.0f64);
     for &end in levels {
-        let steps = (end - c).abs().div_euclid(STEP) as usize + 1;
+        let longest = if c.abs() < NEAR { STEP } else { STEP * field.coarseness() };
+        let steps = (end - c).abs().div_euclid(longest) as usize + 1;
         let step = (end - c) / steps as f64;
         for _ in 0..steps {
             c += step;
@@ -274,15 +331,17 @@ mod tests {
     use super::super::patch::corners_on_surface;
     use super::*;
     use crate::grid::Transform;
+    use crate::levelset::LevelSet;
     use crate::run::RunOptions;
 
     /// Voxel size 1.
-    fn sampled(reach: i32, half_width: f32, f: impl Fn(DVec3) -> f64 + Sync) -> LevelSet {
+    fn sampled(reach: i32, half_width: f32, f: impl Fn(DVec3) -> f64 + Sync) -> Field {
         let bounds = (IVec3::splat(-reach), IVec3::splat(reach));
-        LevelSet::from_distance(Transform::uniform(1.0), half_width, bounds, f, &RunOptions::default()).unwrap()
+        let level_set = LevelSet::from_distance(Transform::uniform(1.0), half_width, bounds, f, &RunOptions::default());
+        Field::around(&level_set.unwrap(), 8.0)
     }
 
-    fn over(field: &LevelSet, corners: [DVec3; 4]) -> Net {
+    fn over(field: &Field, corners: [DVec3; 4]) -> Net {
         let corners = corners_on_surface(field, corners, 5.0, false).unwrap();
         patch(Level::new(field, 0.0), corners, 2.0, None).unwrap()
     }

@@ -86,6 +86,11 @@ impl Source {
         Ok(Self { mesh, bounds, given: texture, lattices: BTreeMap::new() })
     }
 
+    /// Its polygons.
+    pub fn mesh(&self) -> &TriangleMesh {
+        &self.mesh
+    }
+
     /// Lengths of the box around the surface.
     pub fn size(&self) -> DVec3 {
         self.bounds.1 - self.bounds.0
@@ -126,7 +131,7 @@ pub fn wrapped(
         return Ok(Wrapped { level_set, kernels: None });
     }
     let solid = Solid::new(texture, base, patch, laying, run)?;
-    let leaves = patch.cells.leaves();
+    let leaves = patch.cells().leaves();
     let advice = "take a smaller patch or height, or larger voxels";
     run.reserve(OPERATION, leaves.len() as u64 * BYTES_A_LEAF, advice)?;
     let (made, kernels) = match laying.map {
@@ -134,7 +139,7 @@ pub fn wrapped(
             let implicit = Implicit::new(patch, rbf)?;
             let voxels = leaves.len() as u64 * 512;
             let (made, sums) = implicit.leaves(&solid, leaves, run)?;
-            (made, Some([sums * implicit.particles(), voxels * implicit.particles()]))
+            (made, Some([sums, voxels * implicit.particles()]))
         }
         Map::SemiImplicit | Map::Inverse => (by_inverse(&solid, patch, leaves, run)?, None),
     };
@@ -165,15 +170,9 @@ pub fn warped(
             let uvw = DVec3::new((t.x + i) / f64::from(nu), (t.y + j) / f64::from(nv), t.z - push);
             transform.index_to_world(patch.place(uvw))
         };
-        let first = all.positions.len() as u32;
-        all.positions.par_extend(mesh.positions.par_iter().with_min_len(4096).map(place));
-        all.triangles.extend(mesh.triangles.iter().map(|t| t.map(|v| v + first)));
-        if let Some(colors) = &mesh.colors {
-            all.colors.get_or_insert_default().extend(colors);
-        }
-        if let Some(uvs) = &mesh.uvs {
-            all.uvs.get_or_insert_default().extend(uvs);
-        }
+        let positions = mesh.positions.par_iter().with_min_len(4096).map(place).collect();
+        let (colors, uvs) = (mesh.colors.clone(), mesh.uvs.clone());
+        all.append(TriangleMesh { positions, triangles: mesh.triangles.clone(), colors, uvs });
     }
     all
 }
@@ -201,10 +200,16 @@ pub(super) struct Solid<'a> {
 pub(super) struct Probe<'a>(Sampler<'a>, Sampler<'a>);
 
 impl<'a> Solid<'a> {
-    fn new(texture: &mut Source, base: &'a LevelSet, patch: &Patch, laying: &Laying, run: &RunOptions) -> Result<Self> {
+    pub fn new(
+        texture: &mut Source,
+        base: &'a LevelSet,
+        patch: &Patch,
+        laying: &Laying,
+        run: &RunOptions,
+    ) -> Result<Self> {
         let (lo, size) = (texture.bounds.0, texture.size());
         let tile = laying.tile.map(|n| f64::from(n.max(1)));
-        let [typical, stretch] = patch.cells.stretch(size * DVec3::new(tile[0], tile[1], 1.0));
+        let [typical, stretch] = patch.cells().stretch(size * DVec3::new(tile[0], tile[1], 1.0));
         let texture = texture.lattice(typical, run)?;
         let height = patch.lengths().z;
         Ok(Self {
@@ -384,6 +389,7 @@ pub(super) type Leaves = Vec<(IVec3, LeafValues, LeafMask)>;
 const BLOCK: i32 = 4;
 
 fn by_inverse(solid: &Solid, patch: &Patch, leaves: Vec<IVec3>, run: &RunOptions) -> Result<Leaves> {
+    let cells = patch.cells();
     let task = run.task("wrapping", leaves.len() as u64);
     let made = leaves.into_par_iter().map_init(
         || solid.probe(),
@@ -393,7 +399,7 @@ fn by_inverse(solid: &Solid, patch: &Patch, leaves: Vec<IVec3>, run: &RunOptions
             }
             task.advance(1);
             // Anew in each leaf: what it holds must not depend on the one before.
-            let mut finder = patch.cells.finder();
+            let mut finder = cells.finder();
             let mut at = |ijk: DVec3| finder.find(ijk).map(|uvw| solid.distance(probe, ijk, uvw));
             let far = |d: f64, edge: i32| d.abs() > radius(edge) + solid.half_width();
             let middle = |edge: i32| DVec3::splat(f64::from(edge - 1) / 2.0);

@@ -13,29 +13,31 @@
 //! Cells of the map that fold over (their Jacobian is not positive) or lie in each other are counted and said.
 
 mod places;
+mod report;
 #[cfg(test)]
 mod tests;
 
-use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::json;
 
 use self::places::{Place, Scatter};
+use self::report::{PatchReport, write_particles};
 use super::blend::{Blend, BlendMethod, blend};
 use super::csg::{CsgOperation, csg};
-use super::emboss::read_polylines;
 use super::params::{Vector, VoxelLength, WorldLength, words};
 use super::registry::{Arity, Operator, Outcome, Summary};
 use crate::atomic::write_atomically;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
+use crate::mesh::TriangleMesh;
 use crate::rbf::Basis;
 use crate::run::RunOptions;
-use crate::texture::{Distortion, Laying, Map, Parameterization, Particles, Patch, Rbf, Sampling, Source, wrapped};
+use crate::texture::{
+    Distortion, Laying, Map, Parameterization, Particles, Patch, Rbf, Sampling, Source, warped, wrapped,
+};
 
 words! {
     /// How the space above a patch is divided.
@@ -167,6 +169,13 @@ pub struct Texture {
     /// Write the particles of all patches to this PLY, with their u, v and w and the edges of their nets.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub write_particles: Option<PathBuf>,
+    /// Write the polygons of the texture as they lie on all patches, moved by the semi-implicit map, to this mesh (.obj, .ply, .stl, .off, .glb).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub write_mesh: Option<PathBuf>,
+    /// The mesh whose polygons `write_mesh` moves, with its colours and texture coordinates; the surface of the texture if not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
+    pub mesh: Option<PathBuf>,
 }
 
 impl Default for Texture {
@@ -193,6 +202,8 @@ impl Default for Texture {
             blend: Blending::None,
             blend_distance: None,
             write_particles: None,
+            write_mesh: None,
+            mesh: None,
         }
     }
 }
@@ -301,6 +312,11 @@ impl Operator for Texture {
         if self.blend != Blending::None && self.operation == Joining::None {
             return refuse("blend", "with the operation none".into(), "only with the operations union and difference");
         }
+        if let Some(path) = &self.mesh
+            && self.write_mesh.is_none()
+        {
+            return refuse("mesh", path.display().to_string(), "only with `write_mesh`");
+        }
         if let Some(distance) = self.blend_distance {
             if self.blend == Blending::None {
                 return refuse("blend_distance", distance.to_string(), "only with `blend`");
@@ -365,6 +381,8 @@ impl Texture {
         let laying = self.laying(base.voxel_size());
         let mut report = PatchReport::default();
         let mut particles = Particles::default();
+        let given = self.mesh.as_deref().map(crate::mesh::read).transpose()?.map(|read| read.mesh);
+        let mut moved = TriangleMesh::default();
         let mut laid = Vec::with_capacity(most);
         let task = run.task("patches", most as u64);
         for place in &places.list {
@@ -398,6 +416,12 @@ impl Texture {
                 particles.places.extend(more.places.iter().map(world));
                 particles.edges.extend(more.edges.iter().map(|e| e.map(|v| v + first)));
             }
+            if self.write_mesh.is_some() {
+                let mesh = given.as_ref().unwrap_or(source.mesh());
+                if let Some(bounds) = mesh.bounding_box() {
+                    moved.append(warped(mesh, bounds, &part, &patch, &laying));
+                }
+            }
             let wrapped = wrapped(&part, &mut source, &patch, &laying, run)?;
             report.kernels = report.kernels.zip(wrapped.kernels).map(|(a, b)| [a[0] + b[0], a[1] + b[1]]);
             laid.push(wrapped.level_set);
@@ -415,6 +439,9 @@ impl Texture {
         report.tell(summary, self.map == MapKind::Implicit);
         if let Some(path) = &self.write_particles {
             write_atomically(path, |out| write_particles(out, &particles))?;
+        }
+        if let Some(path) = &self.write_mesh {
+            crate::mesh::write(path, &moved)?;
         }
         Ok(laid)
     }
@@ -460,80 +487,4 @@ impl Texture {
             }
         }
     }
-
-    fn spline_points(&self) -> Result<Vec<DVec3>> {
-        let text = self.spline.as_deref().unwrap_or_default();
-        let points: Option<Vec<DVec3>> =
-            text.split_whitespace().map(|p| p.parse::<Vector>().map(|v| v.0).ok()).collect();
-        if let Some(points) = points.filter(|points| !points.is_empty()) {
-            return Ok(points);
-        }
-        let path = Path::new(text);
-        if !path.exists() {
-            let accepted = "points `x,y,z x,y,z …`, or a file of them";
-            return Err(EditError::parameter(Self::NAME, "spline", text, accepted));
-        }
-        Ok(read_polylines(path)?.into_iter().next().unwrap_or_default())
-    }
-}
-
-/// What the maps of all patches are like.
-struct PatchReport {
-    distortions: Vec<Distortion>,
-    kernels: Option<[u64; 2]>,
-}
-
-impl Default for PatchReport {
-    fn default() -> Self {
-        Self { distortions: Vec::new(), kernels: Some([0; 2]) }
-    }
-}
-
-impl PatchReport {
-    fn add(&mut self, distortion: &Distortion) {
-        self.distortions.push(*distortion);
-    }
-
-    fn tell(&self, summary: &mut Summary, is_implicit: bool) {
-        let sum = |of: fn(&Distortion) -> usize| self.distortions.iter().map(of).sum::<usize>();
-        let (folded, overlapping, cells) = (sum(|d| d.folded), sum(|d| d.overlapping), sum(|d| d.cells));
-        for (count, what) in [(folded, "fold over"), (overlapping, "lie in each other")] {
-            if count > 0 {
-                summary.warnings.push(format!(
-                    "{count} of the {cells} cells above the patches {what}: the texture is torn or meets itself there; take a smaller height or patch, or the parameterization low-distortion or spline"
-                ));
-            }
-        }
-        let details = &mut summary.details;
-        details.insert("patches".into(), self.distortions.len().into());
-        details.insert("folded_cells".into(), folded.into());
-        details.insert("overlapping_cells".into(), overlapping.into());
-        if let (true, Some([near, everywhere])) = (is_implicit, self.kernels) {
-            details.insert("kernel_evaluations".into(), near.into());
-            details.insert("kernel_evaluations_everywhere".into(), everywhere.into());
-        }
-        details.insert("distortion".into(), json!(self.distortions));
-    }
-}
-
-/// Particles as a PLY in text, with the edges of their nets.
-fn write_particles(out: &mut dyn std::io::Write, particles: &Particles) -> std::io::Result<()> {
-    let mut text = String::from("ply\nformat ascii 1.0\n");
-    let _ = writeln!(text, "element vertex {}", particles.places.len());
-    for name in ["x", "y", "z", "u", "v", "w"] {
-        let _ = writeln!(text, "property float {name}");
-    }
-    let _ = writeln!(text, "element edge {}", particles.edges.len());
-    text += "property int vertex1\nproperty int vertex2\nend_header\n";
-    for (p, uvw) in &particles.places {
-        let _ = writeln!(
-            text,
-            "{} {} {} {} {} {}",
-            p.x as f32, p.y as f32, p.z as f32, uvw.x as f32, uvw.y as f32, uvw.z as f32
-        );
-    }
-    for [a, b] in &particles.edges {
-        let _ = writeln!(text, "{a} {b}");
-    }
-    out.write_all(text.as_bytes())
 }

@@ -10,7 +10,7 @@ use crate::error::{EditError, Result};
 use crate::grid::offset_to_local;
 use crate::levelset::LevelSet;
 use crate::ops::confine::cut_out;
-use crate::ops::emboss::Flat;
+use crate::ops::emboss::{Flat, read_polylines};
 use crate::ops::params::Vector;
 use crate::ops::registry::Operator;
 use crate::run::RunOptions;
@@ -64,6 +64,22 @@ impl Texture {
         }
         let corners: std::result::Result<[Vector; 4], _> = self.corners.clone().try_into();
         Ok(Places::all(corners.map(|c| Place::Corners(c.map(|v| v.0))).into_iter().collect()))
+    }
+
+    /// The points of `spline`, typed or in a file.
+    pub(super) fn spline_points(&self) -> Result<Vec<DVec3>> {
+        let text = self.spline.as_deref().unwrap_or_default();
+        let points: Option<Vec<DVec3>> =
+            text.split_whitespace().map(|p| p.parse::<Vector>().map(|v| v.0).ok()).collect();
+        if let Some(points) = points.filter(|points| !points.is_empty()) {
+            return Ok(points);
+        }
+        let path = Path::new(text);
+        if !path.exists() {
+            let accepted = "points `x,y,z x,y,z …`, or a file of them";
+            return Err(EditError::parameter(Self::NAME, "spline", text, accepted));
+        }
+        Ok(read_polylines(path)?.into_iter().next().unwrap_or_default())
     }
 
     /// A square net around a point by the exponential map.

@@ -159,6 +159,35 @@ fn particles_are_written_with_their_coordinates() {
 }
 
 #[test]
+fn moved_polygons_keep_colours_and_coordinates() {
+    let folder = tempfile::tempdir().unwrap();
+    let (from, to) = (folder.path().join("from.ply"), folder.path().join("to.ply"));
+    let quad = crate::mesh::TriangleMesh {
+        positions: vec![DVec3::ZERO, DVec3::X, DVec3::new(1.0, 1.0, 0.5), DVec3::Y],
+        triangles: vec![[0, 1, 2], [0, 2, 3]],
+        colors: Some(vec![[1.0, 0.0, 0.0, 1.0]; 4]),
+        uvs: Some(vec![[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
+    };
+    crate::mesh::write(&from, &quad).unwrap();
+    let texture = Texture {
+        write_mesh: Some(to.clone()),
+        mesh: Some(from),
+        tile: [2.0, 1.0],
+        push: Some(VoxelLength::new(0.0)),
+        ..on_torus()
+    };
+    apply(&torus(24.0, 9.0), &spike(), &texture).unwrap();
+    let moved = crate::mesh::read(&to).unwrap().mesh;
+    assert_eq!((moved.positions.len(), moved.triangles.len()), (8, 4));
+    assert_eq!(moved.uvs.unwrap()[..4], quad.uvs.unwrap());
+    assert_eq!(moved.colors.unwrap().len(), 8);
+    // On the surface where z was 0, counter-clockwise as before.
+    let torus = torus(24.0, 9.0);
+    assert!(torus.sampler().trilinear(moved.positions[0]).abs() < 0.05);
+    assert!(torus.sampler().trilinear(moved.positions[2]) > 2.9);
+}
+
+#[test]
 fn refusals_name_what_to_change() {
     let (torus, spike) = (torus(24.0, 9.0), spike());
     let said = |texture: Texture| {
@@ -178,6 +207,8 @@ fn refusals_name_what_to_change() {
         (Texture { height: Some(WorldLength::new(0.1)), ..good.clone() }, ["height", "1 to"]),
         (Texture { height: Some(WorldLength::new(0.0)), ..good.clone() }, ["height", "finite"]),
         (Texture { lambda: [-1.0, 0.3], map: MapKind::Implicit, ..good.clone() }, ["lambda", "0 (through"]),
+        (Texture { lambda: [0.005, 11.0], map: MapKind::Implicit, ..good.clone() }, ["lambda", "to 10"]),
+        (Texture { mesh: Some("a.obj".into()), ..good.clone() }, ["mesh", "write_mesh"]),
         (Texture { lambda: [0.1, 0.3], ..good.clone() }, ["lambda", "implicit"]),
         (Texture { tile: [1.5, 1.0], ..good.clone() }, ["tile", "whole"]),
         (Texture { spline: Some("0,0,1".into()), ..good.clone() }, ["spline", "only with"]),
