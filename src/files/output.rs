@@ -53,6 +53,9 @@ pub struct Written {
     pub details: Map<String, Value>,
 }
 
+/// Linear colours (red, green, blue, opacity) at positions of the world.
+pub type Colors<'a> = dyn Fn(&[DVec3]) -> Result<Vec<[f32; 4]>> + 'a;
+
 impl Output {
     /// An output that is refused now if it could not be written later.
     pub fn plan(path: PathBuf, options: VolumeOptions, mesh: &MeshParams) -> Result<Self> {
@@ -113,7 +116,7 @@ impl Output {
         &self,
         level_set: &LevelSet,
         from: Option<(&Volume, Option<usize>)>,
-        colors: &dyn Fn(&[DVec3]) -> Result<Vec<[f32; 4]>>,
+        colors: &Colors<'_>,
         run: &RunOptions,
     ) -> Result<Written> {
         run.check("writing")?;

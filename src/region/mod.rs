@@ -47,7 +47,7 @@ pub trait Region: Send + Sync {
 #[inline(always)]
 pub fn ramp(beta: f64) -> f64 {
     // Without branches, so that loops over it are vector code.
-    let beta = beta.max(0.0).min(1.0);
+    let beta = beta.clamp(0.0, 1.0);
     let (rising, settling) = (2.0 * beta * beta, 1.0 - 2.0 * (beta - 1.0) * (beta - 1.0));
     if beta <= 0.5 { rising } else { settling }
 }
