@@ -213,13 +213,8 @@ struct IndexBox {
 impl IndexBox {
     /// Around a region, if it has bounds.
     fn around(region: &dyn Region, level_set: &LevelSet) -> Option<Self> {
-        let (lo, hi) = region.bounds()?;
-        let corners = (0..8).map(|c| {
-            let pick = |axis: usize| if c >> axis & 1 == 1 { hi[axis] } else { lo[axis] };
-            level_set.transform().world_to_index(DVec3::new(pick(0), pick(1), pick(2)))
-        });
-        let empty = Self { lo: DVec3::INFINITY, hi: DVec3::NEG_INFINITY };
-        Some(corners.fold(empty, |b, p| Self { lo: b.lo.min(p), hi: b.hi.max(p) }))
+        let (lo, hi) = level_set.transform().box_to_index(region.bounds()?);
+        Some(Self { lo, hi })
     }
 
     fn padded(&self, voxels: f64) -> Self {

@@ -101,15 +101,13 @@ impl RegionWeights {
                     alpha.0.fill(0.0);
                 }
                 let mut positive = LeafMask::EMPTY;
-                let (new, origin) = (unknown(id), grid.origin(id).as_dvec3());
-                let positive_here = &mut positive;
                 dispatch(RimLeaf {
                     region,
                     transform,
-                    origin,
-                    new,
+                    origin: grid.origin(id).as_dvec3(),
+                    new: unknown(id),
                     alpha,
-                    positive: positive_here,
+                    positive: &mut positive,
                     places: &mut places,
                 });
                 found.push((id, positive));
