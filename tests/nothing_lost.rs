@@ -30,6 +30,14 @@ fn content(folder: &Path) -> String {
     whole["grids"].to_string()
 }
 
+/// What `out.vdb` holds after one and after the other; the second stays.
+fn both(folder: &Path) -> [String; 2] {
+    [FIRST, SECOND].map(|words| {
+        assert_eq!(code(folder, &words), Some(0));
+        content(folder)
+    })
+}
+
 #[test]
 fn kill_at_any_moment_leaves_the_old_file_or_the_new_one() {
     let folder = tempfile::tempdir().unwrap();
@@ -68,10 +76,7 @@ fn kill_at_any_moment_leaves_the_old_file_or_the_new_one() {
 fn two_runs_on_one_output_leave_one_of_their_results() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let contents = [FIRST, SECOND].map(|words| {
-        assert_eq!(code(folder, &words), Some(0));
-        content(folder)
-    });
+    let contents = both(folder);
     for _ in 0..5 {
         let both = [FIRST, SECOND].map(|words| start(folder, &words));
         both.into_iter().for_each(|mut child| assert_eq!(child.wait().unwrap().code(), Some(0)));
@@ -115,10 +120,7 @@ fn a_target_that_is_closed_to_writing_or_gone_is_said_before_any_work() {
 fn an_input_replaced_while_it_is_read_is_one_of_both() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let contents = [FIRST, SECOND].map(|words| {
-        assert_eq!(code(folder, &words), Some(0));
-        content(folder)
-    });
+    let contents = both(folder);
     for round in 0..5 {
         let mut writer = start(folder, if round % 2 == 0 { &FIRST } else { &SECOND });
         while writer.try_wait().unwrap().is_none() {
