@@ -596,6 +596,49 @@ fn messages_for_programs_are_json_lines() {
 }
 
 #[test]
+fn textures_that_cannot_work_are_named() {
+    let desk = Desk::new();
+    let asset = |name: &str| format!("{}/assets/{name}", env!("CARGO_MANIFEST_DIR"));
+    let (spike, shape) = (asset("spike.obj"), ["--voxel-size", "0.04", "-o"]);
+    desk.done(&[&["shape", "sphere radius=1"], &shape[..], &["ball.vdb"]].concat());
+    desk.done(&[&["shape", "torus major=1 minor=0.3"], &shape[..], &["torus.vdb"]].concat());
+    std::fs::write(desk.path("flat.obj"), "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n").unwrap();
+    let cube = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1\nf 4 3 2 1\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n";
+    std::fs::write(desk.path("open.obj"), cube).unwrap();
+    let good = ["-0.3,-0.3,0.9", "0.3,-0.3,0.9", "0.3,0.3,0.9", "-0.3,0.3,0.9"];
+    let [a, b, c, d] = good;
+    let texture = |base: &str, texture: &str, corners: [&str; 4], more: &[&str]| {
+        let words = [&["texture", base, texture, "-o", "out.vdb", "--corners"], &corners[..], more].concat();
+        desk.run(&words)
+    };
+    let refused =
+        |corners: [&str; 4], more: &[&str], words: &[&str]| texture("ball.vdb", &spike, corners, more).fails(2, words);
+    refused([a, a, c, d], &["--height", "0.2"], &["corners", "1 and 2 coincide"]);
+    refused(["-0.3,-0.3,3", b, c, d], &["--height", "0.2"], &["corners", "corner 1", "from the surface"]);
+    refused([d, c, b, a], &["--height", "0.2"], &["corners", "clockwise", "the other way round"]);
+    refused(good, &["--height", "-2.2"], &["height", "smaller", "through itself"]);
+    refused(good, &["--height", "0.2", "--map", "implicit", "--lambda", "11,0.3"], &["lambda", "0", "10"]);
+    refused(good, &["--height", "0.2", "--map", "implicit", "--lambda", "-0.1,0.3"], &["lambda", "0", "10"]);
+    // All around the hole.
+    let around = ["0.7,0.7,0.3", "-0.7,0.7,0.3", "-0.7,-0.7,0.3", "0.7,-0.7,0.3"];
+    texture("torus.vdb", &spike, around, &["--height", "0.2"]).fails(2, &["corners", "hole"]);
+    // No volume; and an open one, which is closed with a word, or refused.
+    texture("ball.vdb", "flat.obj", good, &["--height", "0.2"]).fails(3, &["flat.obj", "encloses no voxel", "closed"]);
+    texture("ball.vdb", "open.obj", good, &["--height", "0.2", "--strict"]).fails(3, &["open.obj", "open"]);
+    assert_eq!(desk.names(), ["ball.vdb", "flat.obj", "open.obj", "torus.vdb"]);
+    let done = texture("ball.vdb", "open.obj", good, &["--height", "0.2", "--write-particles", "net.ply"]);
+    assert_eq!(done.code, 0, "{}", done.err);
+    assert!(["open.obj", "is open", "close it"].iter().all(|w| done.err.contains(w)), "{}", done.err);
+    // The net is drawn.
+    let draw =
+        |color: &str, path: &str| desk.run(&["render", "ball.vdb", "-o", path, "--color-by", color, "--size", "64x48"]);
+    for (color, path) in [("patch:net.ply", "net.png"), ("distortion:net.ply", "distortion.png")] {
+        assert_eq!(draw(color, path).code, 0, "{}", draw(color, path).err);
+    }
+    draw("patch:open.obj", "none.png").fails(3, &["open.obj", "--write-particles"]);
+}
+
+#[test]
 fn threads_and_instruction_sets_give_the_same_bits() {
     let desk = Desk::new();
     desk.sphere("a.vdb");

@@ -16,7 +16,7 @@ use crate::files::{frames, input, output};
 use crate::levelset::LevelSet;
 use crate::ops::Vector;
 use crate::region::{Region, RegionPlan};
-use crate::render::{CameraSpec, ColorBy, Frame, Image, RenderOptions, UpAxis, render};
+use crate::render::{CameraSpec, ColorBy, Frame, Image, Patches, RenderOptions, UpAxis, render};
 
 /// The command.
 pub const VERB: Verb = Verb { name: "render", build, run };
@@ -31,6 +31,8 @@ enum Color {
     Component,
     Geodesic,
     Difference(PathBuf),
+    Patch(PathBuf),
+    Distortion(PathBuf),
 }
 
 fn build(command: Command) -> Command {
@@ -42,7 +44,7 @@ fn build(command: Command) -> Command {
         .arg(
             option("color-by", "WHAT")
                 .value_parser(ValueParser::new(color))
-                .help("clay, curvature, normal, component, geodesic (with --from), region (with --region) or difference:OTHER [default: clay]"),
+                .help("clay, curvature, normal, component, geodesic (with --from), region (with --region), difference:OTHER, or patch:PARTICLES and distortion:PARTICLES (of texture --write-particles) [default: clay]"),
         )
         .arg(
             option("from", "X,Y,Z")
@@ -77,7 +79,7 @@ fn build(command: Command) -> Command {
         )
         .arg(
             option("range", "NUMBER").value_parser(value_parser!(f64)).help(
-                "Where colours saturate: curvature in 1/voxel [default: 0.125], difference in voxels [default: 1], geodesic in world units [default: the farthest]",
+                "Where colours saturate: curvature in 1/voxel [default: 0.125], difference in voxels [default: 1], geodesic in world units [default: the farthest], distortion above 1 [default: 1]",
             ),
         )
         .arg(
@@ -100,12 +102,12 @@ fn color(text: &str) -> Result<Color, String> {
         "region" => Color::Region,
         "component" => Color::Component,
         "geodesic" => Color::Geodesic,
-        _ => match text.strip_prefix("difference:") {
-            Some(other) if !other.is_empty() => Color::Difference(other.into()),
+        _ => match text.split_once(':') {
+            Some(("difference", file)) if !file.is_empty() => Color::Difference(file.into()),
+            Some(("patch", file)) if !file.is_empty() => Color::Patch(file.into()),
+            Some(("distortion", file)) if !file.is_empty() => Color::Distortion(file.into()),
             _ => {
-                return Err(
-                    "there are clay, curvature, normal, component, geodesic, region and difference:OTHER".into()
-                );
+                return Err("there are clay, curvature, normal, component, geodesic, region, difference:OTHER, patch:PARTICLES and distortion:PARTICLES".into());
             }
         },
     })
@@ -171,10 +173,16 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         Color::Geodesic => Some(input.level_set.geodesic(&from, &context.run)?.reached()),
         _ => None,
     };
+    let patches = match &color {
+        Color::Patch(path) | Color::Distortion(path) => Some(Patches::read(path)?),
+        _ => None,
+    };
     let label = |xyz: DVec3| components.as_ref()?.nearest(input.level_set.transform().world_to_index(xyz));
-    let color_by = match (&color, &distances) {
-        (Color::Component, _) => ColorBy::Label(&label),
-        (Color::Geodesic, Some(field)) => ColorBy::Geodesic(field),
+    let color_by = match (&color, &distances, &patches) {
+        (Color::Component, ..) => ColorBy::Label(&label),
+        (Color::Geodesic, Some(field), _) => ColorBy::Geodesic(field),
+        (Color::Patch(_), _, Some(patches)) => ColorBy::Patches(patches),
+        (Color::Distortion(_), _, Some(patches)) => ColorBy::Distortion(patches),
         _ => color.of(inputs.get(1).map(|input| &input.level_set), region.as_deref()),
     };
     for (path, turn) in &frames {
@@ -282,7 +290,9 @@ mod tests {
         assert!(camera("1").is_err() && camera("a,b").is_err());
         assert_eq!(color("difference:a.vdb"), Ok(Color::Difference("a.vdb".into())));
         assert_eq!(color("geodesic"), Ok(Color::Geodesic));
-        assert!(color("difference:").is_err() && color("colour").is_err());
+        assert_eq!(color("patch:p.ply"), Ok(Color::Patch("p.ply".into())));
+        assert_eq!(color("distortion:p.ply"), Ok(Color::Distortion("p.ply".into())));
+        assert!(color("difference:").is_err() && color("patch").is_err() && color("colour").is_err());
     }
 
     #[test]

@@ -93,7 +93,7 @@ fn nearest(source: &TriangleMesh, tree: &Bvh, frame: &UnitFrame, p: DVec3) -> So
 
 /// Barycentric coordinates of a point of a triangle, which may be a segment or a point: then all weight is on the nearest
 /// corner.
-fn barycentric(p: DVec3, [a, b, c]: [DVec3; 3]) -> [f64; 3] {
+pub(crate) fn barycentric(p: DVec3, [a, b, c]: [DVec3; 3]) -> [f64; 3] {
     let normal = (b - a).cross(c - a);
     let area_squared = normal.length_squared();
     let v = normal.dot((p - a).cross(c - a)) / area_squared;
@@ -154,6 +154,7 @@ mod tests {
             positions: vec![DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::ZERO, DVec3::Y, -DVec3::X],
             triangles: vec![[0, 1, 2], [3, 4, 5]],
             uvs: Some(vec![[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [1.0, 1.0], [1.0, 1.0]]),
+            normals: None,
             colors: None,
         };
         let points = [DVec3::new(1e-3, 0.5, 1.0), DVec3::new(-1e-3, 0.5, 1.0), DVec3::new(0.0, 0.5, 0.0)];

@@ -61,7 +61,10 @@ impl MeshFindings {
         };
         say(
             converted.boundary_edges > 0,
-            format!("the mesh is open ({} boundary edges): {closing}", converted.boundary_edges),
+            format!(
+                "the mesh is open ({} boundary edges): {closing}; close it in a modelling tool if that is not what is meant (`strict` refuses it)",
+                converted.boundary_edges
+            ),
         );
         say(
             converted.boundary_edges == 0 && self.closure_triangles > 0,

@@ -25,6 +25,7 @@ mod topology;
 mod unit;
 mod winding;
 
+pub(crate) use attributes::barycentric;
 pub use attributes::{Attributes, transfer_attributes};
 pub use bezier::BezierPatches;
 pub use bvh::{Bvh, Hit};
@@ -61,6 +62,8 @@ pub struct TriangleMesh {
     pub colors: Option<Vec<[f32; 4]>>,
     /// Texture coordinates, one a vertex.
     pub uvs: Option<Vec<[f32; 2]>>,
+    /// Normals that a file gave, one a vertex.
+    pub normals: Option<Vec<[f32; 3]>>,
 }
 
 impl TriangleMesh {
@@ -86,6 +89,7 @@ impl TriangleMesh {
         }
         self.colors = joined(self.colors.take(), other.colors, was_empty);
         self.uvs = joined(self.uvs.take(), other.uvs, was_empty);
+        self.normals = joined(self.normals.take(), other.normals, was_empty);
     }
 
     /// Smallest box around the positions that triangles use; `None` without triangles.

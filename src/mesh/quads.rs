@@ -44,7 +44,7 @@ impl QuadMesh {
     /// The same mesh in triangles: each quad is cut along the diagonal across which its halves face most alike.
     pub fn into_triangles(self) -> TriangleMesh {
         let triangles = self.quads.par_iter().flat_map_iter(|quad| cut(*quad, &self.positions)).collect();
-        TriangleMesh { positions: self.positions, triangles, colors: self.colors, uvs: self.uvs }
+        TriangleMesh { positions: self.positions, triangles, colors: self.colors, uvs: self.uvs, normals: None }
     }
 }
 

@@ -202,6 +202,7 @@ fn compact(mesh: &TriangleMesh, triangles: &[[u32; 3]]) -> TriangleMesh {
         triangles: triangles.iter().map(|t| t.map(|v| number[v as usize])).collect(),
         colors: mesh.colors.as_ref().map(|colors| kept.iter().map(|&v| colors[v]).collect()),
         uvs: mesh.uvs.as_ref().map(|uvs| kept.iter().map(|&v| uvs[v]).collect()),
+        normals: mesh.normals.as_ref().map(|normals| kept.iter().map(|&v| normals[v]).collect()),
     }
 }
 

@@ -223,14 +223,19 @@ impl Planner<'_, '_> {
 
     /// A file of a parameter: one that is written, or one that is read and must be there.
     fn file(&mut self, name: &str, text: &str, place: &str) -> Result<String> {
-        let is_output = matches!(self.step.op, Op::Write | Op::Render) && name == "path";
-        let folder = match &self.recipe.output_folder {
-            Some(folder) if is_output => folder,
-            _ => self.recipe.folder(),
+        let by_operator = name.starts_with("write_");
+        let is_output = by_operator || matches!(self.step.op, Op::Write | Op::Render) && name == "path";
+        let output_folder = self.recipe.output_folder.as_deref().unwrap_or(self.recipe.folder());
+        let in_folder = |folder: &Path| {
+            let path = folder.join(text);
+            numbered(&path, self.frame).unwrap_or(path)
         };
-        let path = folder.join(text);
-        let path = numbered(&path, self.frame).unwrap_or(path);
-        if !is_output {
+        let mut path = in_folder(output_folder);
+        if by_operator {
+            self.plan.outputs.push(path.clone());
+        } else if !is_output && !self.plan.outputs.contains(&path) {
+            // Not what an earlier step writes.
+            path = in_folder(self.recipe.folder());
             readable(&path).map_err(|error| error.at(place))?;
             self.plan.files.push(path.clone());
         }

@@ -10,7 +10,7 @@ use serde_json::{Map, Value};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::ops::{RegionSpecs, Vector, parse, words};
-use crate::render::{CameraSpec, ColorBy, Frame, Image, RenderOptions, UpAxis, render};
+use crate::render::{CameraSpec, ColorBy, Frame, Image, Patches, RenderOptions, UpAxis, render};
 use crate::run::RunOptions;
 
 /// Pictures beside each other.
@@ -33,6 +33,10 @@ words! {
         Difference = "difference",
         /// Distance along the surface from `from`, in stripes with `stripes`; along that of the second input, if there is one.
         Geodesic = "geodesic",
+        /// Patches of a texture, of `patches`, with the lines of their nets.
+        Patch = "patch",
+        /// The same with how much their maps distort.
+        Distortion = "distortion",
     }
 }
 
@@ -63,6 +67,10 @@ pub(super) struct Picture {
     /// With `geodesic`: stripes of this width (world units) of two colours in turn.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stripes: Option<f64>,
+    /// With `patch` and `distortion`: the particles that a step `texture` wrote with `write_particles`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
+    pub patches: Option<String>,
     /// Width and height in pixels, of each input's picture.
     pub size: [u32; 2],
     /// Where from, in degrees: around the up axis, above the horizon and, if given, field of view.
@@ -72,7 +80,7 @@ pub(super) struct Picture {
     /// Lower and upper corner of what the picture shows, six numbers; if not given, of all inputs.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frame_box: Option<[f64; 6]>,
-    /// Where colours saturate: curvature in 1/voxel (0.125 if not given), difference in voxels (1).
+    /// Where colours saturate: curvature in 1/voxel (0.125 if not given), difference in voxels (1), distortion above 1 (1).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub range: Option<f64>,
     /// Leave the background transparent.
@@ -88,6 +96,7 @@ impl Default for Picture {
             region: RegionSpecs::default(),
             from: Vec::new(),
             stripes: None,
+            patches: None,
             size: [options.width, options.height],
             camera: vec![camera.azimuth, camera.elevation],
             up: Up::Y,
@@ -122,6 +131,11 @@ impl Picture {
             && (read.color_by != Color::Geodesic || !(width > 0.0 && width.is_finite()))
         {
             return refuse("stripes", width.to_string(), "a positive width, with `color_by = \"geodesic\"`");
+        }
+        if matches!(read.color_by, Color::Patch | Color::Distortion) != read.patches.is_some() {
+            let accepted =
+                "`color_by` with \"patch\" or \"distortion\" and `patches`, a file of particles, go together";
+            return refuse("patches", read.patches.clone().unwrap_or_default(), accepted);
         }
         if let Some([a, b, c, d, e, f]) = read.frame_box
             && !(a < d && b < e && c < f)
@@ -198,6 +212,7 @@ impl Picture {
             }
             _ => None,
         };
+        let patches = self.patches.as_deref().map(|path| Patches::read(Path::new(path))).transpose()?;
         let stripe = |xyz: DVec3| {
             let (field, width) = (distances.as_ref()?, self.stripes?);
             let ijk = field.transform().world_to_index(xyz);
@@ -213,6 +228,8 @@ impl Picture {
             (Color::Component, ..) => ColorBy::Label(&label),
             (Color::Region, Some(region), _) => ColorBy::Region(&**region),
             (Color::Difference, _, Some(other)) => ColorBy::Difference(other),
+            (Color::Patch, ..) => patches.as_ref().map_or(ColorBy::Clay, ColorBy::Patches),
+            (Color::Distortion, ..) => patches.as_ref().map_or(ColorBy::Clay, ColorBy::Distortion),
             _ => ColorBy::Clay,
         };
         render(level_set, &color_by, options, run)

@@ -6,8 +6,10 @@
 
 mod camera;
 mod field;
+mod legend;
 mod march;
 mod occlusion;
+mod patches;
 mod png;
 mod shade;
 mod skip;
@@ -19,6 +21,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use camera::{CameraSpec, Frame, UpAxis};
+pub(crate) use patches::PROPERTIES;
+pub use patches::Patches;
 pub use png::Image;
 pub use vertices::{distance_colors, vertex_colors};
 
@@ -40,8 +44,9 @@ pub const MAX_SIZE: u32 = 16384;
 const OPERATION: &str = "render";
 /// Curvature at which the diverging colours are saturated, where nothing else is asked: a radius of 8 voxels.
 pub const CURVATURE_RANGE: f64 = 0.125;
-/// Difference at which they are, in voxels.
+/// Difference at which they are, in voxels, and distortion above 1.
 const DIFFERENCE_RANGE: f64 = 1.0;
+const DISTORTION_RANGE: f64 = 1.0;
 /// How far an obstacle darkens the sky, as a part of the surface's largest extent.
 const OCCLUSION_RANGE: f64 = 0.35;
 /// Rays of a pixel to the key light; sixteen pixels share theirs.
@@ -64,6 +69,10 @@ pub enum ColorBy<'a> {
     Region(&'a dyn Region),
     /// A colour for each number that the function gives a world position near the surface, as of connected components; clay for `None`.
     Label(&'a (dyn Fn(DVec3) -> Option<u32> + Sync)),
+    /// Patches of a texture: lines of u and v; clay around them.
+    Patches(&'a Patches),
+    /// The same, and how much the map distorts: s1/s2 from 1, dark, to 1 + `range`, bright, with a legend.
+    Distortion(&'a Patches),
 }
 
 /// How a picture is made.
@@ -83,7 +92,7 @@ pub struct RenderOptions {
     /// Whether the surface throws shadows on itself.
     pub shadow: bool,
     /// Value at which the diverging colours are saturated: curvature in 1/voxel (0.125 where not given), difference in voxels (1),
-    /// distance along the surface in world units (the farthest).
+    /// distance along the surface in world units (the farthest), distortion above 1 (1).
     pub range: Option<f64>,
     /// Leaves the background transparent.
     pub transparent_background: bool,
@@ -187,9 +196,11 @@ pub fn render(
     };
     let default_range = match color_by {
         ColorBy::Difference(_) => DIFFERENCE_RANGE,
+        ColorBy::Distortion(_) => DISTORTION_RANGE,
         ColorBy::Geodesic(field) => field.range().map_or(1.0, |(_, most)| f64::from(most).max(f64::MIN_POSITIVE)),
         _ => CURVATURE_RANGE,
     };
+    let range = options.range.unwrap_or(default_range);
     let picture = Picture {
         scene: skip.map(|skip| Scene { field: Field::new(level_set.grid(), level_set.voxel_size()), skip }),
         camera,
@@ -197,7 +208,7 @@ pub fn render(
         lights,
         light,
         color_by,
-        range: DataRange(options.range.unwrap_or(default_range)),
+        range: DataRange(range),
         antialias: options.antialias,
         width,
         height,
@@ -229,7 +240,11 @@ pub fn render(
             rgba8[at..at + row_bytes].copy_from_slice(bytes);
         }
     }
-    Ok(Image { width, height, rgba8 })
+    let mut image = Image { width, height, rgba8 };
+    if matches!(color_by, ColorBy::Distortion(_)) {
+        legend::draw(&mut image, 1.0, 1.0 + range);
+    }
+    Ok(image)
 }
 
 #[cfg(test)]

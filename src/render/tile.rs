@@ -170,6 +170,8 @@ impl Picture<'_> {
             }
             ColorBy::Region(region) => REGION_OFF.lerp(REGION_ON, f64::from(region.weight(xyz())).clamp(0.0, 1.0)),
             ColorBy::Label(label) => label(xyz()).map_or(shade::CLAY, shade::label),
+            ColorBy::Patches(patches) => patches.color(xyz(), None).unwrap_or(shade::CLAY),
+            ColorBy::Distortion(patches) => patches.color(xyz(), Some(self.range.0)).unwrap_or(shade::CLAY),
         };
         Some(Hit {
             point: FilterPoint { position, normal },

@@ -1,10 +1,11 @@
 //! The cells of a patch volume: the exact inverse of its map, folds, and distortion.
 
 use std::collections::BTreeSet;
+use std::sync::OnceLock;
 
 use glam::{DMat3, DVec3, IVec3};
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
 use serde::Serialize;
 use smallvec::SmallVec;
 
@@ -83,6 +84,16 @@ pub(super) struct Cells {
     sign: f64,
     bin: f64,
     bins: FxHashMap<IVec3, SmallVec<[u32; 4]>>,
+    flaws: OnceLock<Flaws>,
+}
+
+/// Where the map is not one to one.
+struct Flaws {
+    /// Cells of the texture whose Jacobian is not positive somewhere, and those whose middle lies in another, earlier one.
+    folded: usize,
+    overlapping: usize,
+    /// Leaves that such cells, or such cells around the texture, may reach into.
+    leaves: FxHashSet<IVec3>,
 }
 
 impl Cells {
@@ -127,7 +138,7 @@ impl Cells {
                 }
             }
         }
-        Self { cells, sign: if volume.mirrors { -1.0 } else { 1.0 }, bin, bins }
+        Self { cells, sign: if volume.mirrors { -1.0 } else { 1.0 }, bin, bins, flaws: OnceLock::new() }
     }
 
     /// Looks places up, one after the other.
@@ -145,36 +156,75 @@ impl Cells {
         cell.find(x).map(|t| cell.low + (cell.high - cell.low) * t)
     }
 
-    /// Cells of the texture whose middle lies in another, earlier cell as well: the space above the patch meets itself.
-    pub fn overlaps(&self) -> usize {
-        let meets = |(i, cell): (usize, &Cell)| {
-            let middle = cell.at(DVec3::splat(0.5)).0;
-            let others = self.bins.get(&(middle / self.bin).floor().as_ivec3())?;
-            let found = |&k: &u32| {
-                let (k, own) = (k as usize, (cell.low + cell.high) / 2.0);
-                let other = &self.cells[k];
-                let away = (own - (other.low + other.high) / 2.0).abs();
-                k < i
-                    && other.holds_texture()
-                    && away.cmpgt((cell.high - cell.low) * 1.5).any()
-                    && self.in_cell(k, middle).is_some()
-            };
-            others.iter().any(found).then_some(())
+    /// The least determinant over the corners of a cell, where a fold shows first; positive where the map does not fold.
+    fn least_determinant(&self, cell: &Cell) -> f64 {
+        let corner = |c: usize| {
+            let t = DVec3::new((c >> 2) as f64, (c >> 1 & 1) as f64, (c & 1) as f64);
+            self.sign * cell.at(t).1.determinant()
         };
-        self.cells.par_iter().enumerate().filter(|(_, cell)| cell.holds_texture()).filter_map(meets).count()
+        (0..8).map(corner).fold(f64::INFINITY, f64::min)
+    }
+
+    /// An earlier cell, not beside it, that the middle of a cell lies in as well, one of the texture if there is one: the space above the patch meets itself.
+    fn overlapped(&self, i: usize) -> Option<usize> {
+        let cell = &self.cells[i];
+        let middle = cell.at(DVec3::splat(0.5)).0;
+        let others = self.bins.get(&(middle / self.bin).floor().as_ivec3())?;
+        let own = (cell.low + cell.high) / 2.0;
+        let meets = |&k: &usize| {
+            let other = &self.cells[k];
+            let away = (own - (other.low + other.high) / 2.0).abs();
+            k < i && away.cmpgt((cell.high - cell.low) * 1.5).any() && self.in_cell(k, middle).is_some()
+        };
+        let mut found = None;
+        for k in others.iter().map(|&k| k as usize).filter(meets) {
+            found = Some(k);
+            if self.cells[k].holds_texture() {
+                break;
+            }
+        }
+        found
+    }
+
+    fn flaws(&self) -> &Flaws {
+        self.flaws.get_or_init(|| {
+            let flaw = |(i, cell): (usize, &Cell)| (self.least_determinant(cell) <= 0.0, self.overlapped(i));
+            let flaws: Vec<_> = self.cells.par_iter().enumerate().map(flaw).collect();
+            let mut all = Flaws { folded: 0, overlapping: 0, leaves: FxHashSet::default() };
+            for (cell, (folded, overlapped)) in self.cells.iter().zip(flaws) {
+                let other = overlapped.map(|k| &self.cells[k]);
+                if folded || other.is_some() {
+                    // Cells beside it may lie in others by less than half.
+                    for cell in [Some(cell), other].into_iter().flatten() {
+                        let (lo, hi) = cell.bounds;
+                        all.leaves.extend(leaves_between(lo - (hi - lo), hi + (hi - lo)).map(IVec3::from_array));
+                    }
+                }
+                if cell.holds_texture() {
+                    all.folded += usize::from(folded);
+                    all.overlapping += usize::from(other.is_some_and(Cell::holds_texture));
+                }
+            }
+            all
+        })
+    }
+
+    /// Whether the map may fold, or lie in itself, somewhere in a leaf.
+    pub fn folds_in(&self, leaf: IVec3) -> bool {
+        self.flaws().leaves.contains(&leaf)
+    }
+
+    /// (u, v, w) of a place in every cell that holds it.
+    pub fn all(&self, x: DVec3) -> impl Iterator<Item = DVec3> + '_ {
+        let candidates = self.bins.get(&(x / self.bin).floor().as_ivec3());
+        candidates.into_iter().flatten().filter_map(move |&i| self.in_cell(i as usize, x))
     }
 
     /// First voxels of the leaves that the cells touch, in order.
     pub fn leaves(&self) -> Vec<IVec3> {
         let mut leaves = BTreeSet::new();
         for cell in &self.cells {
-            let (lo, hi) = cell.bounds;
-            let (lo, hi) = (leaf_origin(lo.floor().as_ivec3()), leaf_origin(hi.ceil().as_ivec3()));
-            for x in (lo.x..=hi.x).step_by(LEAF_DIM as usize) {
-                for y in (lo.y..=hi.y).step_by(LEAF_DIM as usize) {
-                    leaves.extend((lo.z..=hi.z).step_by(LEAF_DIM as usize).map(|z| [x, y, z]));
-                }
-            }
+            leaves.extend(leaves_between(cell.bounds.0, cell.bounds.1));
         }
         leaves.into_iter().map(IVec3::from_array).collect()
     }
@@ -203,21 +253,12 @@ impl Cells {
             let unit = (cell.high - cell.low) * lengths;
             let (_, by_t) = cell.at(DVec3::splat(0.5));
             let j = DMat3::from_cols(by_t.x_axis / unit.x, by_t.y_axis / unit.y, by_t.z_axis / unit.z);
-            // A fold shows at a corner first.
-            let least = (0..8)
-                .map(|c| {
-                    let t = DVec3::new((c >> 2) as f64, (c >> 1 & 1) as f64, (c & 1) as f64);
-                    let (_, by_t) = cell.at(t);
-                    self.sign * by_t.determinant() / (unit.x * unit.y * unit.z)
-                })
-                .fold(f64::INFINITY, f64::min);
-            // Singular values of the base part, from the metric.
-            let (e, f, g) = (j.x_axis.length_squared(), j.x_axis.dot(j.y_axis), j.y_axis.length_squared());
-            let (mean, spread) = ((e + g) / 2.0, ((e - g) / 2.0).hypot(f));
-            let (s1, s2) = ((mean + spread).sqrt(), (mean - spread).max(0.0).sqrt());
+            let least = self.least_determinant(cell) / (unit.x * unit.y * unit.z);
+            let [s1, s2] = singular_values(j.x_axis, j.y_axis);
             of_cells.push(CellDistortion { angle: s1 / s2, area: s1 * s2, volume: self.sign * j.determinant(), least });
         }
-        Distortion { overlapping: self.overlaps(), ..Distortion::of(&of_cells) }
+        let Flaws { folded, overlapping, .. } = *self.flaws();
+        Distortion { folded, overlapping, ..Distortion::of(&of_cells) }
     }
 }
 
@@ -240,6 +281,22 @@ impl Finder<'_> {
             Some(uvw)
         })
     }
+}
+
+/// Singular values s1 ≥ s2 of the matrix of two columns, from the metric.
+pub(super) fn singular_values(by_u: DVec3, by_v: DVec3) -> [f64; 2] {
+    let (e, f, g) = (by_u.length_squared(), by_u.dot(by_v), by_v.length_squared());
+    let (mean, spread) = ((e + g) / 2.0, ((e - g) / 2.0).hypot(f));
+    [mean + spread, (mean - spread).max(0.0)].map(f64::sqrt)
+}
+
+/// First voxels of the leaves between two places.
+fn leaves_between(lo: DVec3, hi: DVec3) -> impl Iterator<Item = [i32; 3]> {
+    let (lo, hi) = (leaf_origin(lo.floor().as_ivec3()), leaf_origin(hi.ceil().as_ivec3()));
+    let step = LEAF_DIM as usize;
+    (lo.x..=hi.x).step_by(step).flat_map(move |x| {
+        (lo.y..=hi.y).step_by(step).flat_map(move |y| (lo.z..=hi.z).step_by(step).map(move |z| [x, y, z]))
+    })
 }
 
 /// Places at which one of two even divisions of 0..1 has a border, and one cell more on both sides.
@@ -311,7 +368,7 @@ impl Distortion {
             area: Spread::of(cells.iter().map(|c| ratio(c.area, area))),
             volume: Spread::of(cells.iter().map(|c| ratio(c.volume, volume))),
             least_determinant: cells.iter().map(|c| c.least / volume).fold(f64::INFINITY, f64::min),
-            folded: cells.iter().filter(|c| c.least <= 0.0).count(),
+            folded: 0,
             overlapping: 0,
             cells: cells.len(),
         }

@@ -3,7 +3,7 @@
 //! The band of the base knows them near the surface. Beyond, they are found at the nodes of a lattice, so coarse that there is a bounded number of
 //! nodes in the space: the farther a level is from the surface, the smoother it is. A node's distance is that of its closest point: from the
 //! nearest of many points of the surface the tangent plane leads on to it. Between nodes they are linear, which errs by up to g²κ/8 along an
-//! axis, for a lattice of g voxels and levels of curvature κ.
+//! axis, for a lattice of g voxels and levels of curvature κ: above a sharp edge, where that is large, there are more nodes.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -14,8 +14,9 @@ use crate::grid::{LEAF_DIM, Transform, offset_to_local};
 use crate::levelset::{LevelSet, Sampler};
 use crate::run::RunOptions;
 
-/// Nodes of the lattice above a patch, about, and where only the way back to the surface is asked for.
+/// Nodes of the lattice above a patch, about, the same above a sharp edge, and where only the way back to the surface is asked for.
 pub(super) const ABOVE: f64 = 120e3;
+pub(super) const ABOVE_SHARP: f64 = 1e6;
 pub(super) const GROUND: f64 = 30e3;
 
 /// Edge of the blocks of voxels that get one point of the surface each, in voxels, for lattices up to twice as coarse as the base's and for coarser ones.

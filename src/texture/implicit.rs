@@ -6,14 +6,17 @@
 //! the texture's surface are left out by their middle; where the interpolated value at the middle is off by more than a part of a voxel
 //! of the texture, a block is divided, down to single voxels, which are summed exactly.
 
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 use smallvec::SmallVec;
 
 use super::OPERATION;
+use super::leaves::{ADVICE, Found, Leaves, Made, block, closed, radius};
 use super::space::Patch;
-use super::wrap::{Leaves, Made, Solid, block, catmull_rom, radius};
+use super::wrap::{Probe, Solid, catmull_rom};
 use crate::error::{EditError, Result};
 use crate::grid::{LEAF_DIM, LEAF_VOXELS, leaf_origin};
 use crate::rbf::{Basis, Interpolant};
@@ -108,13 +111,18 @@ impl<'a> Implicit<'a> {
             edge /= 2;
         }
         // Leaves, then blocks of the lattice's size, that the texture's surface may be in.
-        let mut blocks = self.near(solid, &leaves, LEAF_DIM, &mut sums, run)?;
+        let (mut blocks, whole) = self.near(solid, &leaves, LEAF_DIM, &mut sums, run)?;
+        let mut found: Vec<Block> = Vec::new();
+        let inner = |edge: i32, blocks: Vec<IVec3>| {
+            blocks.into_iter().map(move |origin| Block { origin, edge, held: true, how: How::Inside })
+        };
         if edge < LEAF_DIM {
             let split =
                 blocks.iter().flat_map(|b| block(LEAF_DIM / edge).map(move |c| b.0 + c * edge)).collect::<Vec<_>>();
-            blocks = self.near(solid, &split, edge, &mut sums, run)?;
+            let inside;
+            (blocks, inside) = self.near(solid, &split, edge, &mut sums, run)?;
+            found.extend(inner(edge, inside));
         }
-        let mut found: Vec<Block> = Vec::new();
         let voxels = solid.extent() / solid.voxel_size();
         loop {
             let (nodes, taken) = self.nodes(blocks.iter().map(|b| b.0), edge, run)?;
@@ -127,7 +135,8 @@ impl<'a> Implicit<'a> {
                     let middle = around.middle();
                     let good = ((middle - exact) * voxels).abs().max_element() < TOLERANCE;
                     let held = self.holds(origin.as_dvec3() + f64::from(edge - 1) / 2.0, exact);
-                    (Block { origin, edge, held, around: good.then(|| Box::new(around)) }, good)
+                    let how = if good { How::Between(Box::new(around)) } else { How::Summed };
+                    (Block { origin, edge, held, how }, good)
                 })
                 .collect();
             let mut rest = Vec::new();
@@ -144,67 +153,87 @@ impl<'a> Implicit<'a> {
             let split: Vec<IVec3> =
                 rest.iter().flat_map(|b| block(2).map(|c| b.origin + c * (edge / 2)).collect::<Vec<_>>()).collect();
             edge /= 2;
-            blocks = self.near(solid, &split, edge, &mut sums, run)?;
+            let inside;
+            (blocks, inside) = self.near(solid, &split, edge, &mut sums, run)?;
+            found.extend(inner(edge, inside));
         }
         let of_block = |b: &Block| {
             let voxels = b.edge.pow(3) as u64;
-            b.around.as_ref().map_or(voxels * particles, |around| around.cones.len() as u64 * (65 + voxels))
+            match &b.how {
+                How::Inside => 0,
+                How::Summed => voxels * particles,
+                How::Between(around) => around.cones.len() as u64 * (65 + voxels),
+            }
         };
         sums += found.iter().map(of_block).sum::<u64>();
         found.par_sort_unstable_by_key(|b| (leaf_origin(b.origin).to_array(), b.origin.to_array()));
-        let leaves: Vec<&[Block]> = found.chunk_by(|a, b| leaf_origin(a.origin) == leaf_origin(b.origin)).collect();
-        let made = leaves.into_par_iter().map_init(
+        let parts: Vec<&[Block]> = found.chunk_by(|a, b| leaf_origin(a.origin) == leaf_origin(b.origin)).collect();
+        let made = parts.into_par_iter().map_init(
             || (solid.probe(), [DVec3::ZERO; LEAF_VOXELS]),
             |(probe, map), blocks| {
                 let origin = leaf_origin(blocks.first()?.origin);
-                let mut made = Made::new(solid);
+                let mut made = Made::new(solid.base);
                 for b in blocks {
-                    let within = b.origin - origin;
-                    let Some(around) = &b.around else {
-                        for offset in block(b.edge) {
-                            let ijk = (b.origin + offset).as_dvec3();
-                            if let Some(uvw) = self.find(ijk) {
-                                made.set(within + offset, solid.distance(probe, ijk, uvw));
-                            }
-                        }
-                        continue;
-                    };
-                    around.fill(map);
-                    for part in block(b.edge / 2) {
-                        // Halves of a block that the band does not reach.
-                        let first = part * 2;
-                        let at = |o: IVec3| map[((o.x * b.edge + o.y) * b.edge + o.z) as usize];
-                        let middle = (at(first) + at(first + 1)) / 2.0;
-                        let d = solid.distance(probe, (b.origin + first).as_dvec3() + 0.5, middle);
-                        if b.held && d.abs() > radius(2) + solid.half_width() {
-                            made.fill(within + first, 2, d);
-                            continue;
-                        }
-                        for offset in block(2).map(|c| first + c) {
-                            let (ijk, uvw) = ((b.origin + offset).as_dvec3(), at(offset));
-                            if b.held || self.holds(ijk, uvw) {
-                                made.set(within + offset, solid.distance(probe, ijk, uvw));
-                            }
-                        }
-                    }
+                    self.fill(&mut made, b, solid, probe, map);
                 }
-                (!made.mask.is_empty()).then_some((origin, made.values, made.mask))
+                Some(made.found(origin))
             },
         );
-        let made = made.flatten().collect();
+        let mut made: Vec<Found> = made.flatten().collect();
+        made.extend(whole.into_iter().map(|origin| Found::Whole(origin, true)));
         run.check(OPERATION)?;
-        Ok((made, sums))
+        let summed = AtomicU64::new(0);
+        let full = |origin: IVec3| {
+            summed.fetch_add(LEAF_VOXELS as u64 * particles, Ordering::Relaxed);
+            let mut made = Made::new(solid.base);
+            self.sum_up(&mut made, origin, LEAF_DIM, solid, &mut solid.probe());
+            made
+        };
+        let leaves = closed(made, full, run)?;
+        Ok((leaves, sums + summed.into_inner()))
     }
 
-    /// Of blocks of `edge` voxels, those that the texture's surface and its band may be in, with (u, v, w) of their middles.
-    fn near(
-        &self,
-        solid: &Solid,
-        blocks: &[IVec3],
-        edge: i32,
-        sums: &mut u64,
-        run: &RunOptions,
-    ) -> Result<Vec<(IVec3, DVec3)>> {
+    /// The voxels of a block in its leaf; `map` is scratch.
+    fn fill(&self, made: &mut Made, b: &Block, solid: &Solid, probe: &mut Probe, map: &mut [DVec3; LEAF_VOXELS]) {
+        let within = b.origin - leaf_origin(b.origin);
+        let around = match &b.how {
+            How::Inside => return made.fill(within, b.edge, true),
+            How::Summed => return self.sum_up(made, b.origin, b.edge, solid, probe),
+            How::Between(around) => around,
+        };
+        around.fill(map);
+        for part in block(b.edge / 2) {
+            // Halves of a block that the band does not reach.
+            let first = part * 2;
+            let at = |o: IVec3| map[((o.x * b.edge + o.y) * b.edge + o.z) as usize];
+            let middle = (at(first) + at(first + 1)) / 2.0;
+            let d = solid.distance(probe, (b.origin + first).as_dvec3() + 0.5, middle);
+            if b.held && d.abs() > radius(2) + solid.half_width() {
+                made.fill(within + first, 2, d < 0.0);
+                continue;
+            }
+            for offset in block(2).map(|c| first + c) {
+                let (ijk, uvw) = ((b.origin + offset).as_dvec3(), at(offset));
+                if b.held || self.holds(ijk, uvw) {
+                    made.set(within + offset, solid.distance(probe, ijk, uvw));
+                }
+            }
+        }
+    }
+
+    /// The same by the exact sum at each voxel.
+    fn sum_up(&self, made: &mut Made, origin: IVec3, edge: i32, solid: &Solid, probe: &mut Probe) {
+        let within = origin - leaf_origin(origin);
+        for offset in block(edge) {
+            let ijk = (origin + offset).as_dvec3();
+            if let Some(uvw) = self.find(ijk) {
+                made.set(within + offset, solid.distance(probe, ijk, uvw));
+            }
+        }
+    }
+
+    /// Of blocks of `edge` voxels, those that the texture's surface and its band may be in, with (u, v, w) of their middles, and those that are inside of it.
+    fn near(&self, solid: &Solid, blocks: &[IVec3], edge: i32, sums: &mut u64, run: &RunOptions) -> Result<Near> {
         *sums += blocks.len() as u64 * self.particles();
         let reach = radius(edge) + solid.half_width();
         let near = blocks.par_iter().map_init(
@@ -217,13 +246,21 @@ impl<'a> Implicit<'a> {
                 let uvw = self.interpolant.at(middle);
                 // Outside of its box the texture is as far as the box.
                 let slack = reach * solid.stretch / solid.extent();
-                let inside = uvw.cmpge(self.domain.0 - slack).all() && uvw.cmple(self.domain.1 + slack).all();
-                (inside && solid.distance(probe, middle, uvw).abs() <= reach).then_some((origin, uvw))
+                if uvw.cmplt(self.domain.0 - slack).any() || uvw.cmpgt(self.domain.1 + slack).any() {
+                    return None;
+                }
+                let d = solid.distance(probe, middle, uvw);
+                if d.abs() <= reach {
+                    Some((origin, Some(uvw)))
+                } else {
+                    (d < 0.0 && self.holds(middle, uvw)).then_some((origin, None))
+                }
             },
         );
-        let near = near.flatten().collect();
+        let near: Vec<(IVec3, Option<DVec3>)> = near.flatten().collect();
         run.check(OPERATION)?;
-        Ok(near)
+        let inside = near.iter().filter(|n| n.1.is_none()).map(|n| n.0).collect();
+        Ok((near.into_iter().filter_map(|(origin, uvw)| Some((origin, uvw?))).collect(), inside))
     }
 
     /// Of blocks of `edge` voxels (by origin / edge), the cones of particles in and beside them.
@@ -251,7 +288,7 @@ impl<'a> Implicit<'a> {
                 wanted.insert(origin / edge + c - 1, DVec3::ZERO);
             }
         }
-        run.reserve(OPERATION, wanted.len() as u64 * 64, "take a smaller patch or height, or larger voxels")?;
+        run.reserve(OPERATION, wanted.len() as u64 * 64, ADVICE)?;
         wanted.par_iter_mut().for_each(|(n, value)| {
             if !run.is_cancelled() {
                 *value = self.interpolant.at((*n * edge).as_dvec3() - 0.5);
@@ -263,13 +300,26 @@ impl<'a> Implicit<'a> {
     }
 }
 
-/// A block of voxels near the surface; the map in it is interpolated, or summed up for each voxel.
+/// Blocks near the surface with (u, v, w) of their middles, and blocks inside of it.
+type Near = (Vec<(IVec3, DVec3)>, Vec<IVec3>);
+
+/// A block of voxels in a leaf near the surface.
 struct Block {
     origin: IVec3,
     edge: i32,
     /// Whether the map does not repeat itself in its middle.
     held: bool,
-    around: Option<Box<Around>>,
+    how: How,
+}
+
+/// How the map in a block is found.
+enum How {
+    /// Not at all: all of it is inside.
+    Inside,
+    /// Summed up for each voxel.
+    Summed,
+    /// Interpolated.
+    Between(Box<Around>),
 }
 
 /// Particles whose part a·|x − p| of the sum has its kink nearby: p and a.

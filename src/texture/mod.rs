@@ -7,6 +7,7 @@
 mod cells;
 mod field;
 mod implicit;
+mod leaves;
 mod level;
 mod patch;
 mod path;

@@ -6,8 +6,8 @@ use std::sync::OnceLock;
 use glam::DVec3;
 
 use super::OPERATION;
-use super::cells::{Cells, Distortion};
-use super::field::{ABOVE, Field, GROUND};
+use super::cells::{Cells, Distortion, singular_values};
+use super::field::{ABOVE, ABOVE_SHARP, Field, GROUND};
 use super::level::Level;
 use super::patch::{Net, broken, corners_on_surface, patch};
 use super::volume::{Heights, Volume};
@@ -28,6 +28,9 @@ const LARGEST: f64 = 4000.0;
 
 /// How far below the surface (or above it, if the height goes down) the space goes on, in voxels beyond the half width of the band.
 const BEYOND: f64 = 2.0;
+
+/// Cosine of the angle between the normals of neighbouring particles below which the base is sharp there: levels above are then as curved as they are near.
+const SHARP: f64 = 0.9;
 
 /// Space around what is expected to hold the particles, in voxels; and as a part of the height, where they are pushed aside.
 const MARGIN: f64 = 8.0;
@@ -132,7 +135,7 @@ impl Patch {
         self.cells().finder().find(ijk)
     }
 
-    /// The particles, in voxels, with their (u, v, w), and the edges between them.
+    /// The particles, in voxels, with their (u, v, w), the nets that they make, and how the map distorts the nets.
     pub fn particles(&self) -> Particles {
         let mut all = Particles::default();
         for (net, &w) in self.volume.layers.iter().zip(&self.volume.levels) {
@@ -141,9 +144,18 @@ impl Patch {
             for i in 0..=nu {
                 for j in 0..=nv {
                     all.places.push((net.at(i, j), DVec3::new(i as f64 / nu as f64, j as f64 / nv as f64, w)));
+                    let ([a, b], [c, d]) =
+                        ([i.saturating_sub(1), (i + 1).min(nu)], [j.saturating_sub(1), (j + 1).min(nv)]);
+                    let by_u = (net.at(b, j) - net.at(a, j)) * (nu as f64 / ((b - a) as f64 * self.lengths.x));
+                    let by_v = (net.at(i, d) - net.at(i, c)) * (nv as f64 / ((d - c) as f64 * self.lengths.y));
+                    let [s1, s2] = singular_values(by_u, by_v);
+                    all.distortion.push([s1 / s2, s1 * s2]);
                     let here = first + i * (nv + 1) + j;
                     all.edges.extend((j > 0).then(|| [here - 1, here].map(|k| k as u32)));
                     all.edges.extend((i > 0).then(|| [here - (nv + 1), here].map(|k| k as u32)));
+                    if i > 0 && j > 0 {
+                        all.faces.push([here - nv - 2, here - 1, here, here - nv - 1].map(|k| k as u32));
+                    }
                 }
             }
         }
@@ -151,13 +163,28 @@ impl Patch {
     }
 }
 
-/// Particles and the edges of the nets that they make.
+/// Particles and the nets that they make.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Particles {
     /// Position in voxels and (u, v, w).
     pub places: Vec<(DVec3, DVec3)>,
-    /// Pairs of particles.
+    /// Of each particle s1/s2 and s1·s2 of the map from a texture of the patch's edge lengths to the net, as of [`Distortion`].
+    pub distortion: Vec<[f64; 2]>,
+    /// Edges of the nets: pairs of particles.
     pub edges: Vec<[u32; 2]>,
+    /// Cells of the nets: particles (0, 0), (0, 1), (1, 1), (1, 0) in (u, v).
+    pub faces: Vec<[u32; 4]>,
+}
+
+impl Particles {
+    /// Adds those of another patch.
+    pub fn append(&mut self, other: Self) {
+        let first = self.places.len() as u32;
+        self.places.extend(other.places);
+        self.distortion.extend(other.distortion);
+        self.edges.extend(other.edges.into_iter().map(|e| e.map(|v| v + first)));
+        self.faces.extend(other.faces.into_iter().map(|f| f.map(|v| v + first)));
+    }
 }
 
 /// The distance field around a patch that is to be.
@@ -187,9 +214,9 @@ impl Space {
         // Where the particles go if nothing is in their way.
         let mut sampler = base.sampler();
         let mut points = net.points.clone();
-        for p in &net.points {
-            let normal = sampler.smooth_gradient(*p).normalize_or_zero();
-            points.extend([*p + normal * voxels, *p - normal * (depth * voxels.signum())]);
+        let normals: Vec<DVec3> = net.points.iter().map(|p| sampler.smooth_gradient(*p).normalize_or_zero()).collect();
+        for (p, normal) in net.points.iter().zip(&normals) {
+            points.extend([*p + *normal * voxels, *p - *normal * (depth * voxels.signum())]);
         }
         if let Parameterization::LowDistortion(Some(directions)) = parameterization {
             let to_index = base.transform().to_index().matrix3;
@@ -198,7 +225,8 @@ impl Space {
             }
         }
         let bounds = bounds(&points, voxels.abs() * ASIDE + MARGIN, "corners")?;
-        let field = Field::new(base, bounds, voxels.abs() * ASIDE, ABOVE, run)?;
+        let nodes = if is_sharp(net, &normals) { ABOVE_SHARP } else { ABOVE };
+        let field = Field::new(base, bounds, voxels.abs() * ASIDE, nodes, run)?;
         Ok(Self { field, height: voxels, depth })
     }
 
@@ -240,6 +268,18 @@ impl Space {
         run.check(OPERATION)?;
         Ok(Patch { volume, cells: OnceLock::new(), lengths, raised: height > 0.0, depth })
     }
+}
+
+/// Whether the surface turns sharply between neighbouring points of a net.
+fn is_sharp(net: &Net, normals: &[DVec3]) -> bool {
+    let [nu, nv] = net.counts;
+    let turned = |a: usize, b: usize| normals[a].dot(normals[b]) < SHARP;
+    (0..=nu).any(|i| {
+        (0..=nv).any(|j| {
+            let at = i * (nv + 1) + j;
+            (i > 0 && turned(at - nv - 1, at)) || (j > 0 && turned(at - 1, at))
+        })
+    })
 }
 
 /// The box around points and so much more; refused where it is too far away for voxels.

@@ -261,6 +261,98 @@ fn tiles_meet_without_gaps() {
 }
 
 #[test]
+fn tiles_keep_their_volume() {
+    // The patch and the texture at three times the resolution: what voxels round off the edges of a tile is below a third of a percent of it.
+    let plane = sampled(64, |p| box_distance(p - DVec3::new(0.0, 0.0, -29.75), DVec3::new(50.0, 50.0, 30.0)));
+    let bounds = (IVec3::splat(-60), IVec3::splat(60));
+    let block = |p: DVec3| box_distance(p, DVec3::new(27.2, 24.2, 24.2) * 0.5);
+    let block = LevelSet::from_distance(Transform::uniform(0.5), 3.0, bounds, block, &run()).unwrap();
+    let patch = Patch::between(&plane, rectangle(27.2, 36.3), 24.2, &CONFORMING, &run()).unwrap();
+    for map in MAPS.into_iter().chain([implicit(200)]) {
+        let laying = Laying { tile: [2, 3], map, ..LAYING };
+        let result = wrapped(&plane, &mut source(&block), &patch, &laying, &run()).unwrap().level_set;
+        let ratio = result.measure(&run()).unwrap().volume / (54.4 * 72.6 * 24.2);
+        assert!((ratio - 1.0).abs() < 0.01, "{map:?} {ratio}");
+    }
+}
+
+#[test]
+fn particles_that_coincide_are_refused_without_smoothing() {
+    let plane = plane();
+    let mut patch = Patch::between(&plane, rectangle(8.0, 10.0), 9.0, &CONFORMING, &run()).unwrap();
+    let rbf = Rbf { basis: Basis::Cubic, lambda: [0.0, 0.0], particles: 100 };
+    assert!(Implicit::new(&patch, rbf).is_ok());
+    // All of the upper layers at one place.
+    for net in &mut patch.volume.layers[2..] {
+        net.points.fill(DVec3::Z * 5.0);
+    }
+    let error = Implicit::new(&patch, rbf).err().unwrap().to_string();
+    assert!(["map", "smaller height", "inverse"].iter().all(|w| error.contains(w)), "{error}");
+}
+
+#[test]
+fn on_a_bumpy_part_of_the_bunny_low_distortion_is_evener() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/bunny.ply");
+    if !path.exists() {
+        eprintln!("SKIPPED: {} is absent", path.display());
+        return;
+    }
+    let bunny = crate::mesh::read(&path).unwrap().mesh;
+    let bunny = crate::mesh::level_set_of_mesh(bunny, &Transform::uniform(0.012), 3.0, &run()).unwrap();
+    // The thigh.
+    let corners = [(-0.15, -0.55, 0.5), (0.4, -0.55, 0.5), (0.4, -0.05, 0.45), (-0.15, -0.05, 0.45)];
+    for height in [0.05, 0.1] {
+        let p95 = |how: &Parameterization| {
+            let patch = Patch::between(&bunny, corners.map(DVec3::from), height, how, &run()).unwrap();
+            let distortion = patch.distortion();
+            [distortion.angle.p95, distortion.area.p95, distortion.volume.p95]
+        };
+        let (conforming, even) = (p95(&CONFORMING), p95(&EVEN));
+        for k in 0..3 {
+            // Of the distortion itself, and of its excess over 1, which it has where nothing is distorted.
+            assert!(even[k] <= 0.6 * conforming[k], "{height} {even:?} {conforming:?}");
+            assert!(even[k] - 1.0 <= 0.3 * (conforming[k] - 1.0), "{height} {even:?} {conforming:?}");
+        }
+    }
+}
+
+#[test]
+fn folds_are_closed_and_hold_what_any_of_their_sheets_holds() {
+    // The upper layers of a patch pushed across each other: the map folds, and its surface stays closed.
+    let (plane, texture) = (plane(), letter(0.5));
+    let mut patch = Patch::between(&plane, rectangle(8.0, 10.0), 9.0, &CONFORMING, &run()).unwrap();
+    for net in &mut patch.volume.layers[3..5] {
+        let [_, nv] = net.counts;
+        for (k, p) in net.points.iter_mut().enumerate() {
+            let (i, j) = (k / (nv + 1), k % (nv + 1));
+            *p += DVec3::new(if i % 3 == 1 { 5.0 } else { -1.0 }, if j % 4 == 2 { -4.0 } else { 1.0 }, -3.0);
+        }
+    }
+    assert!(patch.distortion().folded > 0);
+    for map in [Map::Inverse, implicit(200)] {
+        let result =
+            wrapped(&plane, &mut source(&texture), &patch, &Laying { map, ..LAYING }, &run()).unwrap().level_set;
+        assert_eq!(result.check(), [], "{map:?}");
+    }
+    // Particles inside of the texture are inside of what it becomes.
+    let result = wrapped(&plane, &mut source(&texture), &patch, &LAYING, &run()).unwrap().level_set;
+    let (lo, hi) = source(&texture).mesh().bounding_box().unwrap();
+    let (mut of_texture, mut of_result) = (texture.sampler(), result.sampler());
+    let (mut seen, mut missed) = (0, 0usize);
+    for i in 0..3000 {
+        let uvw = [0.618_033_99, 0.754_877_67, 0.569_840_29].map(|step| (f64::from(i) * step).fract());
+        let uvw = DVec3::from_array(uvw);
+        let phi = of_texture.trilinear(texture.transform().world_to_index(lo + (hi - lo) * uvw));
+        if phi < -0.4 {
+            seen += 1;
+            missed += usize::from(of_result.trilinear(patch.place(uvw)) > 0.5);
+        }
+    }
+    // Sheets that the folds press thinner than a voxel are lost.
+    assert!(seen > 100 && missed * 4 < seen, "{missed} of {seen}");
+}
+
+#[test]
 fn a_spline_carries_the_patch_without_crossings() {
     let plane = plane();
     let rod = sampled(14, |p| (p.x.hypot(p.y) - 6.0).max(p.z.abs() - 10.0));

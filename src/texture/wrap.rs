@@ -6,14 +6,15 @@
 
 use std::collections::BTreeMap;
 
-use glam::{DVec3, IVec3};
+use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 
 use super::OPERATION;
 use super::implicit::{Implicit, Rbf};
+use super::leaves::{ADVICE, Found, Leaves, Made, block, closed, radius};
 use super::space::Patch;
 use crate::error::{EditError, Result};
-use crate::grid::{LEAF_DIM, LeafMask, LeafValues, MAX_COORD, Transform, leaf_offset};
+use crate::grid::{LEAF_DIM, MAX_COORD, Transform};
 use crate::levelset::{BYTES_A_LEAF, LevelSet, Sampler, grid_of_leaves};
 use crate::mesh::{Rebuild, TriangleMesh, level_set_of_mesh, level_set_to_mesh, rebuild, with_half_width};
 use crate::run::RunOptions;
@@ -132,8 +133,7 @@ pub fn wrapped(
     }
     let solid = Solid::new(texture, base, patch, laying, run)?;
     let leaves = patch.cells().leaves();
-    let advice = "take a smaller patch or height, or larger voxels";
-    run.reserve(OPERATION, leaves.len() as u64 * BYTES_A_LEAF, advice)?;
+    run.reserve(OPERATION, leaves.len() as u64 * BYTES_A_LEAF, ADVICE)?;
     let (made, kernels) = match laying.map {
         Map::Implicit(rbf) => {
             let implicit = Implicit::new(patch, rbf)?;
@@ -149,7 +149,7 @@ pub fn wrapped(
     Ok(Wrapped { level_set, kernels })
 }
 
-/// The polygons of a texture as they lie on a patch of `base` (world units), by the semi-implicit map; colours and texture coordinates go along. `bounds` is the
+/// The polygons of a texture as they lie on a patch of `base` (world units), by the semi-implicit map; colours, texture coordinates and normals go along. `bounds` is the
 /// box of the texture that becomes the patch.
 pub fn warped(
     mesh: &TriangleMesh,
@@ -172,7 +172,17 @@ pub fn warped(
         };
         let positions = mesh.positions.par_iter().with_min_len(4096).map(place).collect();
         let (colors, uvs) = (mesh.colors.clone(), mesh.uvs.clone());
-        all.append(TriangleMesh { positions, triangles: mesh.triangles.clone(), colors, uvs });
+        // A normal is the cross product of two directions on the surface: it goes by the cofactors of the map's derivative.
+        let turned = |(p, n): (&DVec3, &[f32; 3])| {
+            let along = |axis: DVec3| place(&(*p + axis * size * STEP)) - place(&(*p - axis * size * STEP));
+            let [a, b, c] = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| along(axis) / (axis.dot(size)));
+            let n = Vec3::from_array(*n).as_dvec3();
+            let turned = b.cross(c) * n.x + c.cross(a) * n.y + a.cross(b) * n.z;
+            (turned * a.cross(b).dot(c).signum()).normalize_or_zero().as_vec3().to_array()
+        };
+        let normals = mesh.normals.as_ref();
+        let normals = normals.map(|all| mesh.positions.par_iter().zip(all).with_min_len(4096).map(turned).collect());
+        all.append(TriangleMesh { positions, triangles: mesh.triangles.clone(), colors, uvs, normals });
     }
     all
 }
@@ -180,7 +190,8 @@ pub fn warped(
 /// A texture to be looked up by (u, v, w).
 pub(super) struct Solid<'a> {
     texture: LevelSet,
-    base: &'a LevelSet,
+    pub base: &'a LevelSet,
+    patch: &'a Patch,
     lo: DVec3,
     size: DVec3,
     tile: [f64; 2],
@@ -203,7 +214,7 @@ impl<'a> Solid<'a> {
     pub fn new(
         texture: &mut Source,
         base: &'a LevelSet,
-        patch: &Patch,
+        patch: &'a Patch,
         laying: &Laying,
         run: &RunOptions,
     ) -> Result<Self> {
@@ -224,6 +235,7 @@ impl<'a> Solid<'a> {
             sampling: laying.sampling,
             stretch,
             base,
+            patch,
             texture,
         })
     }
@@ -264,8 +276,12 @@ impl<'a> Solid<'a> {
         let behind = -uvw.z * self.height;
         let phi = phi.max(behind - self.depth);
         if self.raised && behind > SKIN {
-            // Not out of the other side of a thin wall.
-            return phi.max(f64::from(probe.1.trilinear(ijk)) / self.base.voxel_size());
+            let (base, slope) = probe.1.value_and_gradient(ijk);
+            let along = self.patch.place(uvw + DVec3::Z / self.height) - self.patch.place(uvw);
+            if slope.dot(along) < 0.0 {
+                // Not out of the other side of a thin wall.
+                return phi.max(f64::from(base) / self.base.voxel_size());
+            }
         }
         phi
     }
@@ -307,6 +323,9 @@ pub(super) fn catmull_rom(t: f64) -> [f64; 4] {
     ]
 }
 
+/// Step of differences of the map, as a part of the texture's box.
+const STEP: f64 = 1e-4;
+
 /// How far the surface may lie below the particles' net, in voxels: as far a texture goes on behind it in any case.
 const SKIN: f64 = 1.5;
 
@@ -337,81 +356,54 @@ fn cubic(sampler: &mut Sampler, ijk: DVec3) -> f64 {
     sum
 }
 
-/// From the middle of a block of so many voxels along each axis to its outermost ones.
-pub(super) fn radius(edge: i32) -> f64 {
-    f64::from(edge - 1) / 2.0 * 3.0f64.sqrt()
-}
-
-/// A leaf in the making.
-pub(super) struct Made {
-    pub values: LeafValues,
-    pub mask: LeafMask,
-    background: f32,
-    voxel_size: f64,
-}
-
-impl Made {
-    pub fn new(solid: &Solid) -> Self {
-        let background = (solid.base.voxel_size() * solid.half_width()) as f32;
-        Self {
-            values: LeafValues::filled(background),
-            mask: LeafMask::EMPTY,
-            background,
-            voxel_size: solid.base.voxel_size(),
-        }
-    }
-
-    /// A value in voxels.
-    pub fn set(&mut self, local: IVec3, distance: f64) {
-        let offset = leaf_offset(local);
-        let value = (distance * self.voxel_size) as f32;
-        self.values.0[offset] = value.clamp(-self.background, self.background);
-        self.mask.set(offset, value.abs() < self.background);
-    }
-
-    /// One value for a block.
-    pub fn fill(&mut self, local: IVec3, edge: i32, distance: f64) {
-        for offset in block(edge) {
-            self.set(local + offset, distance);
-        }
-    }
-}
-
-/// The voxels of a block.
-pub(super) fn block(edge: i32) -> impl Iterator<Item = IVec3> {
-    (0..edge.pow(3)).map(move |i| IVec3::new(i / (edge * edge), i / edge % edge, i % edge))
-}
-
-/// Leaves of a grid: origin, values, which are active.
-pub(super) type Leaves = Vec<(IVec3, LeafValues, LeafMask)>;
-
 /// Blocks in which a leaf is looked at first.
 const BLOCK: i32 = 4;
 
+/// By the exact inverse of the map. Where cells of it fold or lie in each other, a place has the least of its values: what is inside by one of them is inside.
 fn by_inverse(solid: &Solid, patch: &Patch, leaves: Vec<IVec3>, run: &RunOptions) -> Result<Leaves> {
     let cells = patch.cells();
     let task = run.task("wrapping", leaves.len() as u64);
-    let made = leaves.into_par_iter().map_init(
+    let far = |d: f64, edge: i32| d.abs() > radius(edge) + solid.half_width();
+    let middle = |edge: i32| DVec3::splat(f64::from(edge - 1) / 2.0);
+    let in_full = |probe: &mut Probe, origin: IVec3| {
+        let mut made = Made::new(solid.base);
+        let mut finder = cells.finder();
+        let folds = cells.folds_in(origin);
+        for local in block(LEAF_DIM) {
+            let ijk = (origin + local).as_dvec3();
+            let d = if folds {
+                cells.all(ijk).map(|uvw| solid.distance(probe, ijk, uvw)).reduce(f64::min)
+            } else {
+                finder.find(ijk).map(|uvw| solid.distance(probe, ijk, uvw))
+            };
+            if let Some(d) = d {
+                made.set(local, d);
+            }
+        }
+        made
+    };
+    let found = leaves.into_par_iter().map_init(
         || solid.probe(),
         |probe, origin| {
             if run.is_cancelled() {
-                return None;
+                return Found::Whole(origin, false);
             }
             task.advance(1);
+            if cells.folds_in(origin) {
+                return in_full(probe, origin).found(origin);
+            }
             // Anew in each leaf: what it holds must not depend on the one before.
             let mut finder = cells.finder();
             let mut at = |ijk: DVec3| finder.find(ijk).map(|uvw| solid.distance(probe, ijk, uvw));
-            let far = |d: f64, edge: i32| d.abs() > radius(edge) + solid.half_width();
-            let middle = |edge: i32| DVec3::splat(f64::from(edge - 1) / 2.0);
-            if at(origin.as_dvec3() + middle(LEAF_DIM)).is_some_and(|d| far(d, LEAF_DIM)) {
-                return None;
+            if let Some(d) = at(origin.as_dvec3() + middle(LEAF_DIM)).filter(|d| far(*d, LEAF_DIM)) {
+                return Found::Whole(origin, d < 0.0);
             }
-            let mut made = Made::new(solid);
+            let mut made = Made::new(solid.base);
             for corner in block(LEAF_DIM / BLOCK).map(|c| c * BLOCK) {
                 if let Some(d) = at((origin + corner).as_dvec3() + middle(BLOCK))
                     && far(d, BLOCK)
                 {
-                    made.fill(corner, BLOCK, d.signum() * solid.half_width() * 2.0);
+                    made.fill(corner, BLOCK, d < 0.0);
                     continue;
                 }
                 for local in block(BLOCK).map(|c| corner + c) {
@@ -420,10 +412,10 @@ fn by_inverse(solid: &Solid, patch: &Patch, leaves: Vec<IVec3>, run: &RunOptions
                     }
                 }
             }
-            (!made.mask.is_empty()).then_some((origin, made.values, made.mask))
+            made.found(origin)
         },
     );
-    let made = made.flatten().collect();
+    let found = found.collect();
     run.check(OPERATION)?;
-    Ok(made)
+    closed(found, |origin| in_full(&mut solid.probe(), origin), run)
 }

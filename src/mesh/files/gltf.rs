@@ -1,7 +1,7 @@
 //! glTF 2.0, as `.glb` or as `.gltf` with its data inside or beside it.
 //!
 //! Read: all triangles, strips and fans of the default scene, moved by their nodes (a mirroring node turns their
-//! winding), with `POSITION`, `COLOR_0` and `TEXCOORD_0`. Vertices split for the sake of normals or texture coordinates stay
+//! winding), with `POSITION`, `NORMAL`, `COLOR_0` and `TEXCOORD_0`. Vertices split for the sake of normals or texture coordinates stay
 //! split. glTF counts texture rows from the top, all other formats from the bottom: `v` is turned. Colours are linear.
 //! Extensions that the file requires and that change geometry (Draco, meshopt, instancing …) are refused by name.
 //!
@@ -13,7 +13,7 @@ use std::path::Path;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use glam::{DMat4, DQuat, DVec3, Vec3};
+use glam::{DMat3, DMat4, DQuat, DVec3, Vec3};
 use gltf::accessor::{DataType, Dimensions};
 use gltf::json::validation::Validate;
 use gltf::mesh::Mode;
@@ -39,6 +39,7 @@ pub(super) fn read(path: &Path, data: &[u8]) -> Result<ReadMesh> {
     let file = load(path, data)?;
     let mut colors = Attribute::new([1.0; 4]);
     let mut uvs = Attribute::new([0.0; 2]);
+    let mut normals = Attribute::new([0.0; 3]);
     for (node, to_world) in instances(path, &file.document)? {
         if node.skin().is_some() {
             builder.note("skinned mesh(es) read in their rest pose", || format!("node {}", node.index()));
@@ -73,10 +74,15 @@ pub(super) fn read(path: &Path, data: &[u8]) -> Result<ReadMesh> {
                 [c[0], c[1], c[2], if c[4] > 3.0 { c[3] } else { 1.0 }].map(|c| color::unit(c as f32))
             });
             uvs.extend(added.clone(), values(Semantic::TexCoords(0))?, |c| [c[0] as f32, 1.0 - c[1] as f32]);
+            let turned = DMat3::from_mat4(to_world).inverse().transpose();
+            normals.extend(added.clone(), values(Semantic::Normals)?, |c| {
+                (turned * DVec3::new(c[0], c[1], c[2])).normalize_or_zero().as_vec3().to_array()
+            });
         }
     }
     builder.mesh.colors = colors.values;
     builder.mesh.uvs = uvs.values;
+    builder.mesh.normals = normals.values;
     builder.finish()
 }
 

@@ -155,9 +155,12 @@ fn singles(mesh: &TriangleMesh) -> io::Result<Vec<Vec3>> {
     }
 }
 
-/// Smooth normals: those of the triangles around a place, weighted by area, so that vertices split at a seam shade alike.
+/// Its own normals, or smooth ones: those of the triangles around a place, weighted by area, so that vertices split at a seam shade alike.
 /// Where they cancel, any unit vector: the format allows no other length.
 fn normals(mesh: &TriangleMesh) -> Vec<Vec3> {
+    if let Some(normals) = &mesh.normals {
+        return normals.iter().map(|n| Vec3::from_array(*n).try_normalize().unwrap_or(Vec3::Z)).collect();
+    }
     let mut at_place: FxHashMap<[u64; 3], usize> = FxHashMap::default();
     let place: Vec<usize> = (0..mesh.positions.len())
         .map(|v| *at_place.entry(mesh.positions[v].to_array().map(f64::to_bits)).or_insert(v))
@@ -202,6 +205,7 @@ mod tests {
             triangles: vec![[0, 1, 2]],
             colors: Some(vec![[0.5; 4]; 3]),
             uvs: Some(vec![[0.5; 2]; 3]),
+            normals: None,
         };
         let mut glb = Vec::new();
         write_glb(&mut glb, &mesh).unwrap();

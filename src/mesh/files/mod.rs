@@ -169,19 +169,20 @@ struct Polygons<'a, const N: usize> {
     faces: &'a [[u32; N]],
     colors: Option<&'a [[f32; 4]]>,
     uvs: Option<&'a [[f32; 2]]>,
+    normals: Option<&'a [[f32; 3]]>,
 }
 
 impl<'a> From<&'a TriangleMesh> for Polygons<'a, 3> {
     fn from(mesh: &'a TriangleMesh) -> Self {
         let (colors, uvs) = (mesh.colors.as_deref(), mesh.uvs.as_deref());
-        Self { positions: &mesh.positions, faces: &mesh.triangles, colors, uvs }
+        Self { positions: &mesh.positions, faces: &mesh.triangles, colors, uvs, normals: mesh.normals.as_deref() }
     }
 }
 
 impl<'a> From<&'a QuadMesh> for Polygons<'a, 4> {
     fn from(mesh: &'a QuadMesh) -> Self {
         let (colors, uvs) = (mesh.colors.as_deref(), mesh.uvs.as_deref());
-        Self { positions: &mesh.positions, faces: &mesh.quads, colors, uvs }
+        Self { positions: &mesh.positions, faces: &mesh.quads, colors, uvs, normals: None }
     }
 }
 
@@ -189,7 +190,11 @@ impl<const N: usize> Polygons<'_, N> {
     /// The fields of a mesh are public: nothing is taken for granted before it is written.
     fn check(&self) -> Result<(), String> {
         let vertices = self.positions.len();
-        let attributes = [("colors", self.colors.map(<[_]>::len)), ("uvs", self.uvs.map(<[_]>::len))];
+        let attributes = [
+            ("colors", self.colors.map(<[_]>::len)),
+            ("uvs", self.uvs.map(<[_]>::len)),
+            ("normals", self.normals.map(<[_]>::len)),
+        ];
         for (name, count) in attributes {
             if let Some(count) = count.filter(|&count| count != vertices) {
                 return Err(format!("the mesh has {vertices} vertices but {count} {name}"));
@@ -263,6 +268,7 @@ mod tests {
         let colors = bytes.map(|c: [u8; 4]| super::color::decode(c.map(|c| f32::from(c) / 255.0)));
         mesh.colors = Some(colors.to_vec());
         mesh.uvs = Some(vec![[0.0, 0.0], [0.25, 0.0], [0.0, 0.75], [1.5, -1.0]]);
+        mesh.normals = Some(vec![[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8], [0.0, 0.0, 1.0]]);
         for format in MeshFormat::ALL {
             let path = folder.path().join("a").with_extension(format.extension());
             write(&path, &mesh).unwrap();
@@ -270,11 +276,12 @@ mod tests {
             assert_eq!(back.warnings, Vec::<String>::new(), "{format}");
             let mut expected = mesh.clone();
             if format == MeshFormat::Stl {
-                (expected.colors, expected.uvs) = (None, None);
+                (expected.colors, expected.uvs, expected.normals) = (None, None, None);
             }
             assert_eq!(back.mesh.positions, expected.positions, "{format}");
             assert_eq!(back.mesh.triangles, expected.triangles, "{format}");
             assert_eq!(back.mesh.uvs, expected.uvs, "{format}");
+            assert_eq!(back.mesh.normals, expected.normals, "{format}");
             let colors = |mesh: &TriangleMesh| mesh.colors.clone().unwrap_or_default().concat();
             let (back, expected) = (colors(&back.mesh), colors(&expected));
             assert_eq!(back.len(), expected.len(), "{format}");

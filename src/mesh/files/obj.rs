@@ -5,8 +5,8 @@
 //!
 //! Faces index positions from 1, or back from the latest one by negative numbers; polygons may have any number of corners.
 //! A vertex whose faces give it several texture coordinates (on a seam) is split: the first keeps its number, the others
-//! follow behind all vertices of the file. Colours are the common extension `v x y z r g b`. Normals, groups, materials,
-//! lines and free-form statements are read over.
+//! follow behind all vertices of the file. Colours are the common extension `v x y z r g b`. A vertex has the mean of the
+//! normals of its corners, if all have some. Groups, materials, lines and free-form statements are read over.
 //! Source: Appendix B1 of the manual of Wavefront's Advanced Visualizer.
 
 use std::borrow::Cow;
@@ -30,8 +30,9 @@ const NONE: u32 = u32::MAX;
 struct Statements {
     colors: Vec<Option<[f32; 3]>>,
     uvs: Vec<[f32; 2]>,
-    /// Position and texture coordinate (or [`NONE`]) of all corners, from 0.
-    corners: Vec<(u32, u32)>,
+    normals: Vec<DVec3>,
+    /// Position, texture coordinate and normal (or [`NONE`]) of all corners, from 0.
+    corners: Vec<(u32, u32, u32)>,
     /// The end of each face in `corners`, and its line.
     faces: Vec<(usize, usize)>,
     materials: FxHashSet<Vec<u8>>,
@@ -90,8 +91,12 @@ impl Statements {
                     format!("`{}`, line {line}", String::from_utf8_lossy(rest(text, keyword)))
                 });
             }
+            b"vn" => {
+                let normal = numbers(words.take(3)).unwrap_or_default();
+                self.normals.push(<[f64; 3]>::try_from(normal).map_or(DVec3::ZERO, DVec3::from_array));
+            }
             b"l" | b"p" => builder.note("line(s) and point(s) skipped", place),
-            b"vn" | b"vp" | b"usemtl" | b"o" | b"g" | b"s" | b"mg" => {}
+            b"vp" | b"usemtl" | b"o" | b"g" | b"s" | b"mg" => {}
             b"cstype" | b"deg" | b"bmat" | b"step" | b"curv" | b"curv2" | b"surf" | b"parm" | b"trim" | b"hole"
             | b"scrv" | b"sp" | b"end" | b"con" | b"call" => {
                 builder.note("free-form statement(s) skipped", || format!("`{}`, line {line}", show(keyword)));
@@ -131,7 +136,8 @@ impl Statements {
             let mut next = |count| parts.next().map_or(Ok(NONE), |part| from_zero(part, count));
             let corner = next(builder.mesh.positions.len()).and_then(|v| match v {
                 NONE => Err("no vertex".into()),
-                v => Ok((v, next(self.uvs.len())?)),
+                // Faces were never refused for the sake of normals.
+                v => Ok((v, next(self.uvs.len())?, next(self.normals.len()).unwrap_or(NONE))),
             });
             let bad = |e| builder.refuse(format!("line {line}: face corner `{}`: {e}", show(word)));
             self.corners.push(corner.map_err(bad)?);
@@ -152,11 +158,13 @@ impl Statements {
         let mut uv_of = vec![NONE; in_file];
         let mut copies: FxHashMap<(u32, u32), u32> = FxHashMap::default();
         let mut origin: Vec<u32> = Vec::new();
+        let mut normals = vec![DVec3::ZERO; in_file];
+        let mut has_normals = !self.normals.is_empty();
         let mut polygon = Vec::new();
         let mut start = 0;
         for &(end, line) in &self.faces {
             polygon.clear();
-            for &(v, vt) in &self.corners[start..end] {
+            for &(v, vt, vn) in &self.corners[start..end] {
                 // Said in the file's own counting, from 1.
                 let bad = |what: &str, index: u32, count: usize| {
                     let index = u64::from(index) + 1;
@@ -174,15 +182,21 @@ impl Statements {
                     *known = vt;
                 }
                 let same = vt == NONE || *known == vt || self.uvs[*known as usize] == self.uvs[vt as usize];
-                polygon.push(match same {
+                let own = match same {
                     true => v,
                     false => *copies.entry((v, vt)).or_insert_with(|| {
                         builder.mesh.positions.push(builder.mesh.positions[v as usize]);
                         origin.push(v);
                         uv_of.push(vt);
+                        normals.push(DVec3::ZERO);
                         (builder.mesh.positions.len() - 1) as u32
                     }),
-                });
+                };
+                match self.normals.get(vn as usize) {
+                    Some(normal) => normals[own as usize] += *normal,
+                    None => has_normals = false,
+                }
+                polygon.push(own);
             }
             start = end;
             builder.polygon(&mut polygon, || format!("line {line}"));
@@ -193,6 +207,9 @@ impl Statements {
         if uv_of.iter().any(|&vt| vt != NONE) {
             builder.mesh.uvs =
                 Some(uv_of.iter().map(|&vt| self.uvs.get(vt as usize).copied().unwrap_or_default()).collect());
+        }
+        if has_normals {
+            builder.mesh.normals = Some(normals.iter().map(|n| n.normalize_or_zero().as_vec3().to_array()).collect());
         }
         if !origin.is_empty() {
             builder.warn(format!("{} vertices added where texture coordinates have seams", origin.len()));
@@ -259,12 +276,17 @@ pub(super) fn write<const N: usize>(out: &mut dyn Write, mesh: &Polygons<N>) -> 
     for [u, v] in mesh.uvs.iter().copied().flatten() {
         writeln!(out, "vt {u:?} {v:?}")?;
     }
+    for [x, y, z] in mesh.normals.iter().copied().flatten() {
+        writeln!(out, "vn {x:?} {y:?} {z:?}")?;
+    }
     for face in mesh.faces {
         out.write_all(b"f")?;
         for v in face.map(|v| u64::from(v) + 1) {
-            match mesh.uvs {
-                Some(_) => write!(out, " {v}/{v}")?,
-                None => write!(out, " {v}")?,
+            match (mesh.uvs, mesh.normals) {
+                (Some(_), Some(_)) => write!(out, " {v}/{v}/{v}")?,
+                (None, Some(_)) => write!(out, " {v}//{v}")?,
+                (Some(_), None) => write!(out, " {v}/{v}")?,
+                (None, None) => write!(out, " {v}")?,
             }
         }
         writeln!(out)?;

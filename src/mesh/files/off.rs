@@ -72,6 +72,7 @@ pub(super) fn read(path: &Path, data: &[u8]) -> Result<ReadMesh> {
 
     let mut colors = Vec::new();
     let mut uvs = Vec::new();
+    let mut normals = Vec::new();
     for v in 0..vertices {
         let Some((line, record)) = records.next() else {
             return Err(at(&builder, records.last, format!("the file ends after {v} of {vertices} vertices")));
@@ -80,6 +81,7 @@ pub(super) fn read(path: &Path, data: &[u8]) -> Result<ReadMesh> {
         builder.vertex(vertex.position, || format!("line {line}"))?;
         colors.extend(vertex.color);
         uvs.extend(vertex.uv);
+        normals.extend(vertex.normal);
     }
     let mut polygon = Vec::new();
     for f in 0..faces {
@@ -103,6 +105,7 @@ pub(super) fn read(path: &Path, data: &[u8]) -> Result<ReadMesh> {
     }
     builder.mesh.colors = columns.color.then_some(colors);
     builder.mesh.uvs = columns.uv.then_some(uvs);
+    builder.mesh.normals = (normals.len() == builder.mesh.positions.len()).then_some(normals);
     builder.finish()
 }
 
@@ -126,6 +129,8 @@ fn columns(keyword: &[u8]) -> Result<Columns, String> {
 
 struct Vertex {
     position: DVec3,
+    /// None where it is no numbers.
+    normal: Option<[f32; 3]>,
     color: Option<[f32; 4]>,
     uv: Option<[f32; 2]>,
 }
@@ -137,6 +142,11 @@ fn vertex(record: &[&[u8]], columns: Columns) -> Result<Vertex, String> {
         return Err(format!("a vertex needs {least} numbers here, it has {}", record.len()));
     }
     let [x, y, z] = [number(record[0]), number(record[1]), number(record[2])];
+    let normal = [3, 4, 5].map(|i| record.get(i).and_then(|word| number(word).ok()));
+    let normal = match normal {
+        [Some(x), Some(y), Some(z)] if columns.normal => Some([x, y, z]),
+        _ => None,
+    };
     let mut record = &record[3 + 3 * usize::from(columns.normal)..];
     let uv = match columns.uv {
         true => {
@@ -147,7 +157,7 @@ fn vertex(record: &[&[u8]], columns: Columns) -> Result<Vertex, String> {
         false => None,
     };
     let color = columns.color.then(|| rgba(record)).transpose()?;
-    Ok(Vertex { position: DVec3::new(x?, y?, z?), color, uv })
+    Ok(Vertex { position: DVec3::new(x?, y?, z?), normal, color, uv })
 }
 
 /// Three or four channels: whole numbers are 0..255, numbers with a point are 0..1.
@@ -161,10 +171,15 @@ fn rgba(words: &[&[u8]]) -> Result<[f32; 4], String> {
 }
 
 pub(super) fn write<const N: usize>(out: &mut dyn Write, mesh: &Polygons<N>) -> io::Result<()> {
-    let kind = (if mesh.uvs.is_some() { "ST" } else { "" }, if mesh.colors.is_some() { "C" } else { "" });
-    writeln!(out, "{}{}OFF\n{} {} 0", kind.0, kind.1, mesh.positions.len(), mesh.faces.len())?;
+    let letters = [("ST", mesh.uvs.is_some()), ("C", mesh.colors.is_some()), ("N", mesh.normals.is_some())];
+    let kind: String = letters.into_iter().filter(|(_, has)| *has).map(|(letter, _)| letter).collect();
+    writeln!(out, "{kind}OFF\n{} {} 0", mesh.positions.len(), mesh.faces.len())?;
     for (v, p) in mesh.positions.iter().enumerate() {
         write!(out, "{:?} {:?} {:?}", p.x, p.y, p.z)?;
+        if let Some(normals) = mesh.normals {
+            let [x, y, z] = normals[v];
+            write!(out, " {x:?} {y:?} {z:?}")?;
+        }
         if let Some(colors) = mesh.colors {
             let [r, g, b, a] = color::encode_bytes(colors[v]);
             write!(out, " {r} {g} {b} {a}")?;

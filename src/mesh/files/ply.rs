@@ -178,6 +178,9 @@ fn read_vertices(builder: &mut MeshBuilder, body: &mut Body, element: &ElementDe
             "alpha" | "a" | "diffuse_alpha" => 6,
             "s" | "u" | "texture_u" => 7,
             "t" | "v" | "texture_v" => 8,
+            "nx" => 9,
+            "ny" => 10,
+            "nz" => 11,
             _ => return None,
         })
     };
@@ -186,11 +189,12 @@ fn read_vertices(builder: &mut MeshBuilder, body: &mut Body, element: &ElementDe
     if !(0..3).all(has) {
         return Err(builder.refuse("header: element `vertex` needs the properties x, y and z"));
     }
-    let (colored, mapped) = ((3..6).all(has), (7..9).all(has));
+    let (colored, mapped, normal) = ((3..6).all(has), (7..9).all(has), (9..12).all(has));
     let mut colors = Vec::new();
     let mut uvs = Vec::new();
+    let mut normals = Vec::new();
     for _ in 0..element.count {
-        let mut values = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0];
+        let mut values = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0];
         for (role, data_type) in &properties {
             match data_type {
                 PropertyType::Scalar(scalar) => {
@@ -206,13 +210,16 @@ fn read_vertices(builder: &mut MeshBuilder, body: &mut Body, element: &ElementDe
                 }
             }
         }
-        let [x, y, z, r, g, b, a, u, v] = values;
+        let [x, y, z, r, g, b, a, u, v, ref n @ ..] = values;
         builder.vertex(DVec3::new(x, y, z), || body.place())?;
         if colored {
             colors.push([r, g, b, a].map(|c| c as f32));
         }
         if mapped {
             uvs.push([u as f32, v as f32]);
+        }
+        if normal {
+            normals.push(n.map(|v| v as f32));
         }
     }
     if colored {
@@ -225,6 +232,7 @@ fn read_vertices(builder: &mut MeshBuilder, body: &mut Body, element: &ElementDe
         builder.mesh.colors = Some(colors.iter().map(decode).collect());
     }
     builder.mesh.uvs = mapped.then_some(uvs);
+    builder.mesh.normals = normal.then_some(normals);
     Ok(())
 }
 
@@ -323,6 +331,9 @@ pub(super) fn write<const N: usize>(out: &mut dyn Write, mesh: &Polygons<N>) -> 
     if mesh.uvs.is_some() {
         writeln!(out, "property float s\nproperty float t")?;
     }
+    if mesh.normals.is_some() {
+        writeln!(out, "property float nx\nproperty float ny\nproperty float nz")?;
+    }
     // Signed indices are what the oldest readers expect.
     let index = if mesh.positions.len() <= i32::MAX as usize { "int" } else { "uint" };
     writeln!(out, "element face {}\nproperty list uchar {index} vertex_indices\nend_header", mesh.faces.len())?;
@@ -338,6 +349,9 @@ pub(super) fn write<const N: usize>(out: &mut dyn Write, mesh: &Polygons<N>) -> 
         }
         if let Some(uvs) = mesh.uvs {
             out.write_all(uvs[v].map(f32::to_le_bytes).as_flattened())?;
+        }
+        if let Some(normals) = mesh.normals {
+            out.write_all(normals[v].map(f32::to_le_bytes).as_flattened())?;
         }
     }
     for face in mesh.faces {

@@ -12,6 +12,7 @@
 //! The result of each has exact distances to the surface of the texture as it lies there; the union or difference with the base is that of `csg`.
 //! Cells of the map that fold over (their Jacobian is not positive) or lie in each other are counted and said.
 
+mod loose;
 mod places;
 mod report;
 #[cfg(test)]
@@ -19,12 +20,14 @@ mod tests;
 
 use std::path::PathBuf;
 
-use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
+use self::loose::Loose;
 use self::places::{Place, Scatter};
 use self::report::{PatchReport, write_particles};
+use super::CurvatureOptions;
 use super::blend::{Blend, BlendMethod, blend};
 use super::csg::{CsgOperation, csg};
 use super::params::{Vector, VoxelLength, WorldLength, words};
@@ -109,6 +112,16 @@ words! {
     }
 }
 
+words! {
+    /// What becomes of parts of the texture that do not meet the base.
+    LooseParts {
+        /// They stay, and are counted.
+        Keep = "keep",
+        /// They are left out.
+        Drop = "drop",
+    }
+}
+
 /// Wrap a solid, the texture, onto patches of a surface, the base.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
@@ -161,16 +174,23 @@ pub struct Texture {
     pub interpolation: Between,
     /// What is done with base and texture; `none` gives the texture alone, as it lies there.
     pub operation: Joining,
+    /// With `union`: parts of the texture that do not meet the base, such as pieces of a tile that only the next tile would hold, are kept and counted, or left out (`drop`).
+    pub loose: LooseParts,
     /// How the edge where they meet is blended.
     pub blend: Blending,
     /// Distance from that edge up to which it is blended; that of `blend` if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub blend_distance: Option<VoxelLength>,
-    /// Write the particles of all patches to this PLY, with their u, v and w and the edges of their nets.
+    /// With `blend` curvature: it rests where the mean curvature is below the first number, and acts in full above the second, in 1/voxel; 0.04,0.06 if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
+    pub blend_curvature: Option<[f64; 2]>,
+    /// Write the particles of all patches to this PLY, with their u, v and w, the edges and cells of their nets and how the map distorts these; `render --color-by patch:FILE` and `distortion:FILE` draw them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub write_particles: Option<PathBuf>,
     /// Write the polygons of the texture as they lie on all patches, moved by the semi-implicit map, to this mesh (.obj, .ply, .stl, .off, .glb).
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-kind" = "FILE"))]
     pub write_mesh: Option<PathBuf>,
     /// The mesh whose polygons `write_mesh` moves, with its colours and texture coordinates; the surface of the texture if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -199,8 +219,10 @@ impl Default for Texture {
             push: None,
             interpolation: Between::Linear,
             operation: Joining::Union,
+            loose: LooseParts::Keep,
             blend: Blending::None,
             blend_distance: None,
+            blend_curvature: None,
             write_particles: None,
             write_mesh: None,
             mesh: None,
@@ -213,6 +235,9 @@ const MOST_TILES: f64 = 1000.0;
 
 /// Reach of Wendland's function, in spacings of the particles.
 const SUPPORT: f64 = 4.0;
+
+/// Part of the cells above a patch that may fold over or lie in each other.
+const MOST_FOLDED: f64 = 0.15;
 
 /// Sine of the angle below which directions count as parallel.
 const PARALLEL: f64 = 1e-3;
@@ -312,6 +337,9 @@ impl Operator for Texture {
         if self.blend != Blending::None && self.operation == Joining::None {
             return refuse("blend", "with the operation none".into(), "only with the operations union and difference");
         }
+        if self.loose == LooseParts::Drop && self.operation != Joining::Union {
+            return refuse("loose", "drop".into(), "only with the operation union");
+        }
         if let Some(path) = &self.mesh
             && self.write_mesh.is_none()
         {
@@ -320,6 +348,12 @@ impl Operator for Texture {
         if let Some(distance) = self.blend_distance {
             if self.blend == Blending::None {
                 return refuse("blend_distance", distance.to_string(), "only with `blend`");
+            }
+            self.blending().validate()?;
+        }
+        if let Some([a, b]) = self.blend_curvature {
+            if self.blend != Blending::Curvature {
+                return refuse("blend_curvature", format!("{a},{b}"), "only with `blend` curvature");
             }
             self.blending().validate()?;
         }
@@ -340,7 +374,10 @@ impl Operator for Texture {
             return Ok(Outcome { level_set: base, summary });
         };
         let others: Vec<&LevelSet> = others.iter().collect();
-        let together = csg(first, &others, CsgOperation::Union, run)?;
+        let mut together = csg(first, &others, CsgOperation::Union, run)?;
+        if self.operation == Joining::Union {
+            together = self.without_loose(&base, together, &mut summary, run)?;
+        }
         let operation = match self.operation {
             Joining::None => return Ok(Outcome { level_set: together, summary }),
             Joining::Union => CsgOperation::Union,
@@ -349,7 +386,8 @@ impl Operator for Texture {
         if self.blend == Blending::None {
             return Ok(Outcome { level_set: csg(&base, &[&together], operation, run)?, summary });
         }
-        let (blended, _) = blend(&base, &together, &Blend { operation, ..self.blending() }, run)?;
+        let (blended, found) = blend(&base, &together, &Blend { operation, ..self.blending() }, run)?;
+        summary.details.insert("fillet_radius".into(), json!(found.fillet_radius));
         summary.warnings.extend(blended.summary.warnings);
         summary.steps = blended.summary.steps;
         summary.stopped_because = blended.summary.stopped_because;
@@ -357,12 +395,48 @@ impl Operator for Texture {
     }
 }
 
+/// Refuses a space above a patch that runs through itself.
+fn refuse_folds(distortion: &Distortion, height: f64) -> Result<()> {
+    let Distortion { folded, overlapping, cells, .. } = *distortion;
+    if (folded + overlapping) as f64 <= MOST_FOLDED * cells as f64 {
+        return Ok(());
+    }
+    let accepted = format!(
+        "a smaller height or patch, or the parameterization low-distortion or spline: the space above the patch runs through itself ({folded} of its {cells} cells fold over, {overlapping} lie in others)"
+    );
+    Err(EditError::parameter(Texture::NAME, "height", height, accepted))
+}
+
 impl Texture {
+    /// The texture, or that of it which meets the base.
+    fn without_loose(
+        &self,
+        base: &LevelSet,
+        texture: LevelSet,
+        summary: &mut Summary,
+        run: &RunOptions,
+    ) -> Result<LevelSet> {
+        let loose = Loose::of(&csg(base, &[&texture], CsgOperation::Union, run)?, base, run)?;
+        let (count, most) = loose.count();
+        summary.details.insert("loose_parts".into(), count.into());
+        match (count, self.loose) {
+            (0, _) => Ok(texture),
+            (_, LooseParts::Drop) => loose.dropped_from(&texture, run),
+            (_, LooseParts::Keep) => {
+                summary.warnings.push(format!(
+                    "{count} parts of the texture do not meet the base (the largest has {most} voxels inside); push it in deeper, or leave them out with `loose` drop"
+                ));
+                Ok(texture)
+            }
+        }
+    }
+
     /// How the edge is blended; the operation is set where it is known.
     fn blending(&self) -> Blend {
         let method = if self.blend == Blending::Gaussian { BlendMethod::Gaussian } else { BlendMethod::Curvature };
         let part = |l: VoxelLength| VoxelLength::new(l.voxels(1.0) * 0.75);
-        Blend { method, d_max: self.blend_distance, d_min: self.blend_distance.map(part), ..Blend::default() }
+        let flow = CurvatureOptions { curvature_low: self.blend_curvature, ..CurvatureOptions::default() };
+        Blend { method, d_max: self.blend_distance, d_min: self.blend_distance.map(part), flow, ..Blend::default() }
     }
 
     /// The texture on each patch.
@@ -403,6 +477,9 @@ impl Texture {
                 patch => Some(patch?),
             };
             let made = patch.map(|patch| (patch.distortion(), patch));
+            if let (Some((distortion, _)), None) = (&made, places.scattered) {
+                refuse_folds(distortion, height)?;
+            }
             let good = |made: &(Distortion, Patch)| places.scattered.is_none() || made.0.folded == 0;
             let Some((distortion, patch)) = made.filter(good) else {
                 left_out += 1;
@@ -410,11 +487,9 @@ impl Texture {
             };
             report.add(&distortion);
             if self.write_particles.is_some() {
-                let first = particles.places.len() as u32;
-                let more = patch.particles();
-                let world = |(p, uvw): &(DVec3, DVec3)| (base.transform().index_to_world(*p), *uvw);
-                particles.places.extend(more.places.iter().map(world));
-                particles.edges.extend(more.edges.iter().map(|e| e.map(|v| v + first)));
+                let mut more = patch.particles();
+                more.places.iter_mut().for_each(|(p, _)| *p = base.transform().index_to_world(*p));
+                particles.append(more);
             }
             if self.write_mesh.is_some() {
                 let mesh = given.as_ref().unwrap_or(source.mesh());

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use serde_json::json;
 
 use crate::ops::registry::Summary;
+use crate::render::PROPERTIES;
 use crate::texture::{Distortion, Particles};
 
 /// What the maps of all patches are like.
@@ -46,21 +47,24 @@ impl PatchReport {
     }
 }
 
-/// Particles as a PLY in text, with the edges of their nets.
+/// Particles as a PLY in text, with the cells and edges of their nets.
 pub(super) fn write_particles(out: &mut dyn std::io::Write, particles: &Particles) -> std::io::Result<()> {
     let mut text = String::from("ply\nformat ascii 1.0\n");
     let _ = writeln!(text, "element vertex {}", particles.places.len());
-    for name in ["x", "y", "z", "u", "v", "w"] {
+    for name in PROPERTIES {
         let _ = writeln!(text, "property float {name}");
     }
+    let _ = writeln!(text, "element face {}", particles.faces.len());
+    text += "property list uchar int vertex_indices\n";
     let _ = writeln!(text, "element edge {}", particles.edges.len());
     text += "property int vertex1\nproperty int vertex2\nend_header\n";
-    for (p, uvw) in &particles.places {
-        let _ = writeln!(
-            text,
-            "{} {} {} {} {} {}",
-            p.x as f32, p.y as f32, p.z as f32, uvw.x as f32, uvw.y as f32, uvw.z as f32
-        );
+    for ((p, uvw), distortion) in particles.places.iter().zip(&particles.distortion) {
+        let numbers = p.to_array().into_iter().chain(uvw.to_array()).chain(*distortion);
+        let words: Vec<String> = numbers.map(|v| (v as f32).min(f32::MAX).to_string()).collect();
+        let _ = writeln!(text, "{}", words.join(" "));
+    }
+    for [a, b, c, d] in &particles.faces {
+        let _ = writeln!(text, "4 {a} {b} {c} {d}");
     }
     for [a, b] in &particles.edges {
         let _ = writeln!(text, "{a} {b}");

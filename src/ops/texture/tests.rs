@@ -1,7 +1,7 @@
 use super::*;
 use crate::grid::Transform;
 use crate::levelset::testing::{ball, box_distance, sampled, torus};
-use glam::{DVec2, IVec3};
+use glam::{DVec2, DVec3, IVec3, Vec3};
 
 fn run() -> RunOptions {
     RunOptions::default()
@@ -98,6 +98,98 @@ fn differences_cut_and_blends_round() {
 }
 
 #[test]
+fn a_blended_seam_is_as_round_as_was_asked() {
+    // A block on a block: the seam is a right angle.
+    let slab = sampled(26, |p| box_distance(p - DVec3::new(0.0, 0.0, -10.5), DVec3::new(22.0, 22.0, 10.0)));
+    let pillar = sampled(12, |p| (p.x.hypot(p.y) - 8.0).max(p.z.abs() - 8.0));
+    let plain = Texture {
+        center: Some(Vector(DVec3::Z * -0.5)),
+        radius: Some(WorldLength::new(8.0)),
+        direction: Some(Vector(DVec3::X)),
+        height: Some(WorldLength::new(14.0)),
+        ..Texture::default()
+    };
+    // The most concave place by the seam, away from the rim of the pillar.
+    let most_concave = |texture: &Texture| {
+        let joined = apply(&slab, &pillar, texture).unwrap().level_set;
+        let field = crate::levelset::curvature(&joined, crate::levelset::CurvatureKind::Mean, &run()).unwrap();
+        let mesh = crate::mesh::level_set_to_mesh(&joined, 0.0, &run()).unwrap();
+        let by_seam = mesh.positions.iter().filter(|p| p.z < 6.0 && p.x.hypot(p.y) < 14.0);
+        let mut accessor = field.accessor();
+        let value = |p: &DVec3| crate::levelset::Field::trilinear(&mut accessor, *p).map(f64::from);
+        by_seam.filter_map(value).fold(0.0, f64::min)
+    };
+    let sharp = most_concave(&plain);
+    let asked = Texture {
+        blend: Blending::Curvature,
+        blend_distance: Some(VoxelLength::new(10.0)),
+        blend_curvature: Some([0.08, 0.12]),
+        ..plain.clone()
+    };
+    let round = most_concave(&asked);
+    // By differences over voxels curvature is right to about a tenth where the radius is three of them.
+    assert!(sharp < -0.3 && round > -0.12 * 1.15, "{sharp} {round}");
+    assert!(Texture { blend: Blending::Gaussian, ..asked }.validate().is_err());
+}
+
+#[test]
+fn every_map_gives_the_same_bits_on_one_thread_and_on_three() {
+    let pool = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    let (torus, spike) = (torus(24.0, 9.0), spike());
+    for map in [MapKind::Inverse, MapKind::Implicit, MapKind::SemiImplicit] {
+        for parameterization in [Division::Conforming, Division::LowDistortion] {
+            let texture = Texture { map, parameterization, tile: [2.0, 1.0], ..on_torus() };
+            let once = || apply(&torus, &spike, &texture).unwrap().level_set;
+            let (one, three) = (pool(1).install(once), pool(3).install(once));
+            assert!(crate::ops::compare::compare(&one, &three, &run()).unwrap().identical, "{map:?}");
+        }
+    }
+}
+
+#[test]
+fn loose_parts_are_counted_or_left_out() {
+    let ball = ball(DVec3::ZERO, 20.0);
+    // A plate above a block, apart from it.
+    let texture = sampled(14, |p| {
+        let block = box_distance(p + DVec3::Z * 4.0, DVec3::new(8.0, 8.0, 3.0));
+        block.min(box_distance(p - DVec3::Z * 6.0, DVec3::new(8.0, 8.0, 2.0)))
+    });
+    let on = Texture {
+        center: Some(Vector(DVec3::Z * 20.0)),
+        radius: Some(WorldLength::new(8.0)),
+        height: Some(WorldLength::new(16.0)),
+        ..Texture::default()
+    };
+    let Outcome { level_set, summary } = apply(&ball, &texture, &on).unwrap();
+    assert_eq!(level_set.measure(&run()).unwrap().components, 2);
+    assert!(summary.details["loose_parts"] == 1 && summary.warnings[0].contains("loose"), "{summary:?}");
+    let dropped = Texture { loose: LooseParts::Drop, ..on.clone() };
+    let Outcome { level_set, summary } = apply(&ball, &texture, &dropped).unwrap();
+    assert_eq!(level_set.check(), []);
+    let measures = level_set.measure(&run()).unwrap();
+    assert_eq!((measures.components, measures.euler), (1, 2));
+    assert!(summary.details["loose_parts"] == 1 && summary.warnings.is_empty());
+    assert!(Texture { operation: Joining::None, ..dropped }.validate().is_err());
+}
+
+#[test]
+fn a_space_that_runs_through_itself_is_refused() {
+    // Far down into a ball the normals meet.
+    let ball = ball(DVec3::ZERO, 20.0);
+    let deep = Texture {
+        center: Some(Vector(DVec3::Z * 20.0)),
+        radius: Some(WorldLength::new(10.0)),
+        height: Some(WorldLength::new(-50.0)),
+        operation: Joining::Difference,
+        ..Texture::default()
+    };
+    let error = apply(&ball, &spike(), &deep).err().unwrap();
+    assert_eq!(error.exit_code(), 2);
+    let said = error.to_string();
+    assert!(["height", "smaller", "through itself"].iter().all(|w| said.contains(w)), "{said}");
+}
+
+#[test]
 fn scattered_patches_keep_their_distance_and_follow_their_seed() {
     let ball = ball(DVec3::ZERO, 30.0);
     let centers = |text: &str| -> Vec<DVec3> {
@@ -153,8 +245,9 @@ fn particles_are_written_with_their_coordinates() {
     let header: Vec<&str> = text.lines().take_while(|l| *l != "end_header").collect();
     assert!(header.contains(&"property float w"));
     let count = |what: &str| header.iter().find_map(|l| l.strip_prefix(what)).unwrap().parse::<usize>().unwrap();
-    let (vertices, edges) = (count("element vertex "), count("element edge "));
-    assert_eq!(text.lines().count(), header.len() + 1 + vertices + edges);
+    let (vertices, faces, edges) = (count("element vertex "), count("element face "), count("element edge "));
+    assert_eq!(text.lines().count(), header.len() + 1 + vertices + faces + edges);
+    assert!(crate::render::Patches::read(&path).is_ok());
     assert!(vertices > 200 && edges > vertices);
 }
 
@@ -167,6 +260,7 @@ fn moved_polygons_keep_colours_and_coordinates() {
         triangles: vec![[0, 1, 2], [0, 2, 3]],
         colors: Some(vec![[1.0, 0.0, 0.0, 1.0]; 4]),
         uvs: Some(vec![[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
+        normals: Some(vec![[0.0, 0.0, 1.0]; 4]),
     };
     crate::mesh::write(&from, &quad).unwrap();
     let texture = Texture {
@@ -181,10 +275,16 @@ fn moved_polygons_keep_colours_and_coordinates() {
     assert_eq!((moved.positions.len(), moved.triangles.len()), (8, 4));
     assert_eq!(moved.uvs.unwrap()[..4], quad.uvs.unwrap());
     assert_eq!(moved.colors.unwrap().len(), 8);
+    let normals = moved.normals.unwrap();
     // On the surface where z was 0, counter-clockwise as before.
     let torus = torus(24.0, 9.0);
     assert!(torus.sampler().trilinear(moved.positions[0]).abs() < 0.05);
     assert!(torus.sampler().trilinear(moved.positions[2]) > 2.9);
+    // What was across the box of the texture is across the surface.
+    for v in [0, 1, 3, 4, 5, 7] {
+        let across = torus.sampler().smooth_gradient(moved.positions[v]).normalize().as_vec3();
+        assert!(Vec3::from_array(normals[v]).dot(across) > 0.98, "{v} {across} {:?}", normals[v]);
+    }
 }
 
 #[test]
