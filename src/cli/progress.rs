@@ -123,7 +123,7 @@ impl Progress for Display {
         let bar = (self.style == Style::Bar).then(|| {
             let (bar, template) = match total {
                 0 => (ProgressBar::no_length(), "{msg} {spinner}"),
-                _ => (ProgressBar::new(total), "{msg} {wide_bar} {percent:>3} % {eta}"),
+                _ => (ProgressBar::new(total), "{msg} {wide_bar} {percent:>3} %, {per_sec}, {eta} left"),
             };
             bar.set_draw_target(ProgressDrawTarget::stderr_with_hz(10));
             if let Ok(style) = ProgressStyle::with_template(template) {
