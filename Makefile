@@ -36,7 +36,7 @@ bench: setup
 
 # --tests leaves the documentation's examples out: --include-ignored would run those that are marked as not to be run.
 nightly: setup
-	$(CARGO) test --locked --no-fail-fast --release --tests -- --include-ignored
+	PARSER_SECONDS=600 $(CARGO) test --locked --no-fail-fast --release --tests -- --include-ignored
 	$(CARGO) test --locked --no-fail-fast --doc
 	$(CARGO) test --locked --no-fail-fast --no-default-features --features cli
 

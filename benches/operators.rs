@@ -42,7 +42,7 @@ fn compare(file: &str, resolutions: &[&str]) -> Result<()> {
 }
 
 fn measure(file: &str, resolution: u32, threads: usize) -> Result<()> {
-    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
+    rayon::ThreadPoolBuilder::new().num_threads(threads).use_current_thread().build_global()?;
     vdb_edit::vdb::set_threads(threads)?;
     let run = RunOptions::default();
     let mesh = mesh::read(file.as_ref())?.mesh;

@@ -34,7 +34,7 @@ const FIRST: Tracker = Tracker { scheme: ReferenceScheme::First, runge_kutta: 1,
 
 /// Prints all rows; those whose operator is not there yet say so.
 pub fn measure(threads: usize) -> Result<()> {
-    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
+    rayon::ThreadPoolBuilder::new().num_threads(threads).use_current_thread().build_global()?;
     vdb_edit::vdb::set_threads(threads)?;
     println!("\n{threads} thread(s), OpenVDB {}\n", vdb_edit::vdb::library_version());
     println!("| row | sub-volume | ours, s (min–max of {RUNS}) | target, s | paper, s | OpenVDB, s | ratio |");

@@ -99,8 +99,15 @@ impl Display {
             Style::Bar => Ok(()),
             Style::Lines => writeln!(stderr, "{}: {:.0} % ({seconds:.1} s)", shown.name, progress * 100.0),
             Style::Json => {
-                let event =
-                    json!({ "event": "progress", "task": shown.name, "progress": progress, "seconds": seconds });
+                // At the rate so far; unknown before anything is done.
+                let left = (progress > 0.0).then(|| seconds * (1.0 - progress) / progress);
+                let event = json!({
+                    "event": "progress",
+                    "task": shown.name,
+                    "progress": progress,
+                    "seconds": seconds,
+                    "seconds_left": left,
+                });
                 writeln!(stderr, "{event}")
             }
         };
@@ -123,7 +130,7 @@ impl Progress for Display {
         let bar = (self.style == Style::Bar).then(|| {
             let (bar, template) = match total {
                 0 => (ProgressBar::no_length(), "{msg} {spinner}"),
-                _ => (ProgressBar::new(total), "{msg} {wide_bar} {percent:>3} %, {per_sec}, {eta} left"),
+                _ => (ProgressBar::new(total), "{msg} {wide_bar} {percent:>3} % at {per_sec}, {eta} left"),
             };
             bar.set_draw_target(ProgressDrawTarget::stderr_with_hz(10));
             if let Ok(style) = ProgressStyle::with_template(template) {

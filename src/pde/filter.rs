@@ -226,6 +226,7 @@ mod tests {
 
     use super::*;
     use crate::grid::{Transform, offset_to_local};
+    use crate::levelset::testing::box_distance;
 
     const KINDS: [FilterKind; 3] = [FilterKind::Mean, FilterKind::Gaussian, FilterKind::Median];
     const CENTRE: DVec3 = DVec3::new(0.3, 0.2, -0.4);
@@ -308,6 +309,27 @@ mod tests {
         assert!(before.grid().voxel(IVec3::new(0, 0, 24)).0 < 0.0);
         let after = filtered(before, what, 1, &SolverOptions::OPENVDB);
         assert!(after.grid().voxel(IVec3::new(0, 0, 24)).0 > 0.0 && after.check().is_empty());
+    }
+
+    #[test]
+    fn erosion_keeps_the_corners_of_a_box_and_dilation_rounds_them() {
+        let half = DVec3::new(12.3, 13.1, 12.7);
+        let cuboid = made(3.0, |p| box_distance(p, half));
+        let moved = |by: f64| {
+            let mut level_set = cuboid.clone();
+            offset(&mut level_set, by * 0.5, None, &SolverOptions::OPENVDB, &RunOptions::default()).unwrap();
+            level_set
+        };
+        let (eroded, dilated) = (moved(-4.0), moved(4.0));
+        // Both take eight tracks; beside an edge each may shift the surface by a few hundredths of a voxel.
+        assert!(error(&eroded, 0.5, |p| box_distance(p, half - 4.0)) < 0.25);
+        assert!(error(&dilated, 0.5, |p| box_distance(p, half) - 4.0) < 0.4);
+        let at = |level_set: &LevelSet, p: DVec3| f64::from(level_set.sampler().trilinear(p)) / 0.5;
+        // A corner of voxels is blunt by half a voxel; one that is rounded by 4 ends 2.93 = 4(√3 − 1) before the corner of the box around it.
+        let blunt = at(&eroded, half - 4.0);
+        assert!(blunt.abs() < 0.7, "{blunt}");
+        let rounded = at(&dilated, half + 4.0);
+        assert!((rounded - 4.0 * (3f64.sqrt() - 1.0)).abs() < 0.1, "{rounded}");
     }
 
     #[test]

@@ -14,10 +14,11 @@
 
 use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 use rayon::prelude::*;
+use rustc_hash::FxHashMap;
 
 use super::Tracker;
 use super::domain::Domain;
-use crate::grid::{Grid, LeafSet, LeafValues, PAGE_LEAVES, PageLeaves, Paged};
+use crate::grid::{Grid, LeafId, LeafSet, LeafValues, PageLeaves, Paged};
 use crate::stencil::simd::{Lanes, Work, dispatch};
 
 /// The fastest that a resting surface moves, in voxels a unit of time in voxels squared (F = −H moves a ball of 1000 voxels so).
@@ -98,20 +99,19 @@ impl Tracker<'_> {
     /// Holds φ near what it was at the start where the region's weight is small.
     pub(super) fn hold(&mut self, start: &Grid) {
         let Some(weights) = self.domain.weights() else { return };
-        let grid = &*self.grid;
+        let (grid, domain) = (&*self.grid, &self.domain);
+        let at_rim = |id: &LeafId| {
+            let alpha = &weights.alpha(*id).0;
+            domain.moving(*id, grid.mask(*id)).iter().any(|at| alpha[at] < FREE)
+        };
         // The slots of a leaf differ once leaves have come and gone.
-        let mut place = vec![None; grid.value_pages().page_count() * PAGE_LEAVES];
-        let mut rim = LeafSet::default();
-        for id in self.domain.leaves().iter() {
-            let (alpha, moving) = (&weights.alpha(id).0, self.domain.moving(id, grid.mask(id)));
-            if moving.iter().any(|at| alpha[at] < FREE) {
-                place[id.index()] = Some(start.find(grid.origin(id)));
-                rim.insert(id);
-            }
-        }
-        let (domain, voxel_size) = (&self.domain, self.transform.voxel_size() as f32);
+        let leaves = domain.leaves().par_pages().flat_map_iter(PageLeaves::iter).filter(at_rim);
+        let leaves: Vec<(LeafId, LeafId)> = leaves.map(|id| (id, start.find(grid.origin(id)))).collect();
+        let rim: LeafSet = leaves.iter().map(|(id, _)| *id).collect();
+        let place: FxHashMap<LeafId, LeafId> = leaves.into_iter().collect();
+        let voxel_size = self.transform.voxel_size() as f32;
         self.grid.update(&rim, |id, values, mask| {
-            let Some(before) = place[id.index()] else { return };
+            let Some(&before) = place.get(&id) else { return };
             let (before, alpha) = (&start.values(before).0, &weights.alpha(id).0);
             for at in domain.moving(id, *mask).iter().filter(|&at| alpha[at] < FREE) {
                 let reach = voxel_size * alpha[at] / (1.0 - alpha[at]);

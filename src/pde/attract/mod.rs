@@ -13,6 +13,9 @@
 //! by more than a third of a right angle: the limits fall to −0.4 and 0.1. What is drawn has thus the same shape from far as from near, and a tip
 //! that the voxels show: the flanks of a cone, whose cosine is 0, widen while it grows.
 //!
+//! On an edge or a sharp bump hardly a voxel faces a target by the limits, and what grows from a single voxel is too thin to hold. So around the surface point
+//! closest to a target, now, all within two and a half voxels of the way between the two is drawn that faces it at all.
+//!
 //! F depends on the normal. So where C rises, changes of the normal travel along the surface, with the speed of the Hamiltonian F(n)|∇φ|,
 //!
 //! > ∂(F|∇φ|)/∂∇φ = F n + C'(γ)|φ(p)| (u − (u·n) n),

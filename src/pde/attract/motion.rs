@@ -5,11 +5,12 @@ use std::collections::BTreeMap;
 use fearless_simd::{Simd, SimdBase};
 use glam::{DVec3, IVec3};
 use rustc_hash::{FxHashMap, FxHashSet};
+use smallvec::SmallVec;
 
 use super::super::Tracker;
 use super::super::curvature_flow::upwind_gradient;
 use super::super::evolve::{Motion, Report};
-use super::pull::{Aims, Pull};
+use super::pull::{Distance, Found, Pull};
 use super::{AttractionReport, IndexBounds, OPERATION, REACHED, leaves_around};
 use crate::error::Result;
 use crate::grid::{
@@ -62,6 +63,37 @@ const FARTHEST_AIM: f64 = 1.5;
 /// A number a voxel of leaves, by the leaves' index; none where nothing is drawn.
 type Speeds = FxHashMap<usize, Box<LeafValues>>;
 
+/// What is drawn can grow by no more than this from one look to the next, in voxels.
+const GROWTH: f64 = 4.0;
+
+/// What is drawn: the first and the last voxel of it in each leaf, by the leaf's origin.
+#[derive(Default)]
+struct Drawn(FxHashMap<IVec3, (IVec3, IVec3)>);
+
+impl Drawn {
+    /// The voxels of leaves that have a speed.
+    fn new(grid: &Grid, speeds: &Speeds) -> Self {
+        let bounds = |id: &LeafId| {
+            let (origin, speeds) = (grid.origin(*id), speeds.get(&id.index())?);
+            let drawn = speeds.0.iter().enumerate().filter(|(_, speed)| **speed != 0.0);
+            let voxels = drawn.map(|(at, _)| origin + offset_to_local(at)).map(|ijk| (ijk, ijk));
+            Some((origin, voxels.reduce(|(lo, hi), (ijk, _)| (lo.min(ijk), hi.max(ijk)))?))
+        };
+        Self(grid.leaves().iter().filter_map(bounds).collect())
+    }
+
+    /// The boxes in and around a leaf.
+    fn around(&self, origin: IVec3) -> SmallVec<[(IVec3, IVec3); 27]> {
+        leaves_around(origin).filter_map(|leaf| self.0.get(&leaf).copied()).collect()
+    }
+}
+
+/// Whether a voxel lies within `reach` of one of the boxes.
+fn is_near(boxes: &[(IVec3, IVec3)], ijk: IVec3, reach: f64) -> bool {
+    let gap = |(lo, hi): &(IVec3, IVec3)| (*lo - ijk).max(ijk - *hi).max(IVec3::ZERO).length_squared();
+    boxes.iter().any(|bounds| f64::from(gap(bounds)) <= reach * reach)
+}
+
 /// What the voxels of a leaf feel.
 #[derive(Default)]
 struct LeafFelt {
@@ -76,6 +108,7 @@ struct LeafFelt {
     nearest: Option<f64>,
     /// The targets that are next to the surface.
     touched: Vec<Touched>,
+    distances: Vec<Distance>,
 }
 
 /// A target next to the surface, and the way to it.
@@ -101,9 +134,10 @@ pub(super) struct Drawing<'a> {
     /// The field at the start, in the wide band.
     start: LevelSet,
     within: IndexBounds,
-    /// Origins of the leaves that were drawn in the last step, and those around them: what lies elsewhere has not moved, and so is not drawn
-    /// now. None at first.
-    drawn: Option<FxHashSet<IVec3>>,
+    /// What was drawn at the last look: what lies elsewhere has not moved, and so is not drawn now. None at first.
+    drawn: Option<Drawn>,
+    /// Origins of the leaves that were drawn then, and those around them.
+    around: FxHashSet<IVec3>,
     /// F|∇φ|.
     rates: Speeds,
     /// Origins of the leaves whose surface has moved.
@@ -120,7 +154,7 @@ pub(super) struct Drawing<'a> {
     stepped: Option<Grid>,
     /// The targets that were next to the surface in the last step, by voxel.
     touched: BTreeMap<[i32; 3], Touched>,
-    aims: Aims,
+    found: Found,
 }
 
 impl<'a> Drawing<'a> {
@@ -132,6 +166,7 @@ impl<'a> Drawing<'a> {
             start,
             within,
             drawn: None,
+            around: FxHashSet::default(),
             rates: Speeds::default(),
             leaves: FxHashSet::default(),
             moved: FxHashMap::default(),
@@ -141,7 +176,7 @@ impl<'a> Drawing<'a> {
             substep: f64::INFINITY,
             stepped: None,
             touched: BTreeMap::new(),
-            aims: Aims::default(),
+            found: Found::default(),
         }
     }
 
@@ -153,7 +188,7 @@ impl<'a> Drawing<'a> {
             let side = f64::from(start.trilinear(touched.point)).signum();
             let short = side * f64::from(sampler.trilinear(touched.point)) / finished.voxel_size();
             let Some(towards) = touched.towards.try_normalize() else { continue };
-            let aim = self.aims.entry(IVec3::from_array(*voxel)).or_default();
+            let aim = self.found.aims.entry(IVec3::from_array(*voxel)).or_default();
             *aim = (*aim + towards * (side * short)).clamp_length_max(FARTHEST_AIM);
             missed |= short.abs() > CLOSE_ENOUGH;
         }
@@ -176,7 +211,8 @@ impl<'a> Drawing<'a> {
         let (lo, hi) = self.within;
         let last = origin + (LEAF_DIM - 1);
         let apart = last.as_dvec3().cmplt(lo).any() || origin.as_dvec3().cmpgt(hi).any();
-        if apart || self.drawn.as_ref().is_some_and(|drawn| !drawn.contains(&origin)) {
+        let drawn = self.drawn.as_ref().map(|drawn| drawn.around(origin));
+        if apart || drawn.as_ref().is_some_and(|boxes| boxes.is_empty()) {
             return felt;
         }
         let mut sampler = Sampler::new(grid, voxel_size);
@@ -189,15 +225,19 @@ impl<'a> Drawing<'a> {
             if ijk.as_dvec3().cmplt(lo).any() || ijk.as_dvec3().cmpgt(hi).any() {
                 continue;
             }
+            if drawn.as_ref().is_some_and(|boxes| !is_near(boxes, ijk, GROWTH)) {
+                continue;
+            }
             let alpha = self.pull.region.map_or(1.0, |region| f64::from(region.weight(transform.voxel_to_world(ijk))));
             if alpha <= 0.0 {
                 continue;
             }
-            let Some(voxel) = self.pull.at(&mut sampler, self.original.as_ref(), voxel_size, ijk, near, &self.aims)
+            let Some(voxel) = self.pull.at(&mut sampler, self.original.as_ref(), voxel_size, ijk, near, &self.found)
             else {
                 continue;
             };
             near = Some(voxel.target);
+            felt.distances.push(voxel.place());
             // What is about to be drawn limits the step as well.
             felt.travel = felt.travel.max(voxel.travel * alpha);
             let speed = voxel.speed * alpha;
@@ -224,12 +264,12 @@ impl<'a> Drawing<'a> {
     /// Takes back what tracking the band did beside the surface, where renormalisation wears down tips and what nothing draws: voxels that have never moved
     /// get the values that they had at the start, the others, next to the surface, those of the last step.
     pub fn anchor(&self, tracker: &mut Tracker) {
-        let (Some(stepped), Some(drawn)) = (&self.stepped, &self.drawn) else { return };
+        let Some(stepped) = &self.stepped else { return };
         let voxel_size = self.start.voxel_size() as f32;
         let (start, felt, next) = (self.start.grid(), FELT as f32 * voxel_size, NEXT * voxel_size);
         let grid = &mut *tracker.grid;
         let origins: FxHashMap<usize, IVec3> = grid.leaves().iter().map(|id| (id.index(), grid.origin(*id))).collect();
-        let leaves = grid.leaves().iter().copied().filter(|id| drawn.contains(&origins[&id.index()])).collect();
+        let leaves = grid.leaves().iter().copied().filter(|id| self.around.contains(&origins[&id.index()])).collect();
         grid.update(&leaves, |id, values, _| {
             let Some(origin) = origins.get(&id.index()) else { return };
             let moved = self.moved.get(origin).copied().unwrap_or(LeafMask::EMPTY);
@@ -243,17 +283,29 @@ impl<'a> Drawing<'a> {
         });
     }
 
+    /// Lets the leaves move that are drawn and those around them, as far as the band of what moves reaches: the others are at rest.
+    fn confine(&self, tracker: &mut Tracker) {
+        let grid = tracker.grid();
+        let leaves = grid.leaves().iter().copied().filter(|id| self.around.contains(&grid.origin(*id))).collect();
+        tracker.confine(Some(leaves));
+    }
+
     /// F of the voxels of a leaf that lie farther from the surface.
-    fn continued(&self, grid: &Grid, id: LeafId, near: &Speeds) -> Option<Box<LeafValues>> {
+    fn continued(&self, grid: &Grid, id: LeafId, near: &Speeds, drawn: &Drawn) -> Option<Box<LeafValues>> {
         let voxel_size = self.start.voxel_size();
         let mut sampler = Sampler::new(grid, voxel_size);
         let mut speeds = near.get(&id.index()).cloned();
+        let boxes = drawn.around(grid.origin(id));
         for offset in grid.mask(id).iter() {
             let phi = f64::from(grid.values(id).0[offset]) / voxel_size;
             if phi.abs() <= FELT {
                 continue;
             }
             let ijk = grid.origin(id) + offset_to_local(offset);
+            // The foot point is so far away, and the voxel next to it half a diagonal more at most.
+            if !is_near(&boxes, ijk, phi.abs() + 0.9) {
+                continue;
+            }
             let Some(normal) = sampler.voxel_gradient(ijk).try_normalize() else { continue };
             let foot = (ijk.as_dvec3() - normal * phi).round().as_ivec3();
             if let Some(there) = near.get(&grid.find(leaf_origin(foot)).index()) {
@@ -268,7 +320,12 @@ impl<'a> Drawing<'a> {
 
     /// Finds what every voxel feels.
     fn look(&mut self, grid: &Grid) -> Felts {
-        let felt = grid.map_leaves(|id| self.feel(grid, id));
+        let mut felt = grid.map_leaves(|id| self.feel(grid, id));
+        if self.drawn.is_none() {
+            // What lies closest to the targets is known only now.
+            self.found.note(felt.iter().flat_map(|felt| &felt.distances));
+            felt = grid.map_leaves(|id| self.feel(grid, id));
+        }
         let most = |of: fn(&LeafFelt) -> f64| felt.iter().map(of).fold(0.0, f64::max);
         let count: f64 = felt.iter().map(|f| f.count).sum();
         let felts = Felts {
@@ -282,17 +339,18 @@ impl<'a> Drawing<'a> {
             grid.leaves().iter().zip(speeds).filter_map(|(id, speeds)| Some((id.index(), speeds?))).collect()
         };
         self.touched.clear();
+        self.found.note(felt.iter().flat_map(|felt| &felt.distances));
         for touched in felt.iter().flat_map(|felt| &felt.touched) {
             let place = self.touched.entry(touched.point.round().as_ivec3().to_array());
             place.and_modify(|known| known.towards += touched.towards).or_insert(*touched);
         }
         let speeds = by_leaf(felt.into_iter().map(|felt| felt.speeds).collect());
-        let drawn = grid.leaves().iter().filter(|id| speeds.contains_key(&id.index()));
-        let drawn: Vec<IVec3> = drawn.map(|id| grid.origin(*id)).collect();
-        let around: FxHashSet<IVec3> = drawn.iter().copied().flat_map(leaves_around).collect();
+        let drawn = Drawn::new(grid, &speeds);
+        self.around = drawn.0.keys().copied().flat_map(leaves_around).collect();
         let voxel_size = self.start.voxel_size() as f32;
         self.rates = by_leaf(grid.map_leaves(|id| {
-            let mut speeds = around.contains(&grid.origin(id)).then(|| self.continued(grid, id, &speeds))??;
+            let mut speeds =
+                self.around.contains(&grid.origin(id)).then(|| self.continued(grid, id, &speeds, &drawn))??;
             dispatch(Rate { grid, id, speeds: &mut speeds, voxel_size });
             Some(speeds)
         }));
@@ -302,8 +360,8 @@ impl<'a> Drawing<'a> {
                 rates.0.iter().enumerate().filter(|(_, rate)| **rate != 0.0).for_each(|(at, _)| moved.set(at, true));
             }
         }
-        self.leaves.extend(drawn);
-        self.drawn = Some(around);
+        self.leaves.extend(drawn.0.keys());
+        self.drawn = Some(drawn);
         felts
     }
 }
@@ -335,6 +393,7 @@ impl Motion for Drawing<'_> {
     /// In as many parts as changes of the normal ask for: the band is tracked after all of them, since each renormalisation takes a little off tips.
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
         self.anchor(tracker);
+        self.confine(tracker);
         let mut left = dt;
         loop {
             let part = left / (left / self.substep).ceil().max(1.0);

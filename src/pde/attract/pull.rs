@@ -1,5 +1,7 @@
 //! The force on a surface: what a voxel feels of the target.
 
+use std::cmp::Ordering;
+use std::f64::consts::SQRT_2;
 use std::sync::RwLock;
 
 use glam::{DVec3, IVec3};
@@ -31,6 +33,13 @@ const FOOTING: f64 = 0.5;
 /// of as many voxels more. A single point six voxels off is reached with the least tip.
 const FAR_TIP: f64 = Attraction::TIP / 6.0;
 
+/// How far aside of the way from a target to the surface point closest to it, in voxels, all is drawn whose cosine lies above these, fully above the second. On the
+/// edge of a solid and on a sharp bump hardly a voxel is within the limits of the flow, and what grows from a single one breaks off.
+const FRONT: f64 = 2.5;
+/// The same for far targets, as a part of their distance: two thirds of what the limits draw of a plane.
+const FRONT_SLOPE: f64 = 0.4;
+const FORWARD: [f64; 2] = [0.0, 0.5];
+
 /// Voxels around what is drawn and what draws it that may change as well.
 const MARGIN: f64 = 6.0;
 
@@ -46,6 +55,8 @@ pub(super) struct Felt {
     pub gap: f64,
     /// From the surface to the target, in voxels.
     pub distance: f64,
+    /// The surface point.
+    pub foot: DVec3,
     /// What draws.
     pub target: Target,
     /// From the surface to what draws, or away from it for a target inside: a unit vector.
@@ -60,8 +71,43 @@ pub(super) struct Target {
     nearest: Option<f64>,
 }
 
-/// Places a little beyond points of the target, by voxel: what to aim at instead.
-pub(super) type Aims = FxHashMap<IVec3, DVec3>;
+/// What has been found out about the targets, by voxel.
+#[derive(Default)]
+pub(super) struct Found {
+    /// The surface points that are closest to them now, with their distances, in voxels.
+    pub closest: FxHashMap<IVec3, (f64, DVec3)>,
+    /// What to aim at beyond them.
+    pub aims: FxHashMap<IVec3, DVec3>,
+}
+
+/// The voxel of a target, the distance of a surface point from it, and that point.
+pub(super) type Distance = (IVec3, f64, DVec3);
+
+impl Found {
+    /// Notes the closest of surface points anew.
+    pub fn note<'d>(&mut self, distances: impl Iterator<Item = &'d Distance>) {
+        self.closest.clear();
+        for (target, distance, foot) in distances {
+            let known = self.closest.entry(*target).or_insert((*distance, *foot));
+            let order = distance.total_cmp(&known.0);
+            // Of points that are equally close, the same one in any order.
+            if order.then_with(|| lexical(*foot, known.1)).is_lt() {
+                *known = (*distance, *foot);
+            }
+        }
+    }
+}
+
+fn lexical(a: DVec3, b: DVec3) -> Ordering {
+    a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)).then(a.z.total_cmp(&b.z))
+}
+
+impl Felt {
+    /// What there is to note of it.
+    pub fn place(&self) -> Distance {
+        (self.target.point.round().as_ivec3(), self.distance, self.foot)
+    }
+}
 
 /// The force on a surface.
 pub struct Pull<'a> {
@@ -141,18 +187,36 @@ impl<'a> Pull<'a> {
     /// A box around what is drawn and what draws it, with a margin; `None` if nothing is drawn.
     pub fn drawn_within(&self, level_set: &LevelSet, run: &RunOptions) -> Result<Option<IndexBounds>> {
         let voxel_size = level_set.voxel_size();
-        let boxes = beside_surface(level_set, self.region, run, |drawn: &mut Drawn, sampler, ijk| {
+        let nothing_found = Found::default();
+        let leaves = beside_surface(level_set, self.region, run, |drawn: &mut LeafDrawn, sampler, ijk| {
             // At the start nothing has been pushed: no depth counts yet.
-            let Some(felt) = self.at(sampler, None, voxel_size, ijk, drawn.near, &Aims::default()) else { return };
+            let Some(felt) = self.at(sampler, None, voxel_size, ijk, drawn.near, &nothing_found) else { return };
             drawn.near = Some(felt.target);
-            if felt.share > 0.0 && (self.how.repel || felt.gap >= REACHED) {
-                let point = felt.target.point;
-                let (a, b) = (ijk.as_dvec3().min(point), ijk.as_dvec3().max(point));
-                drawn.bounds = Some(drawn.bounds.map_or((a, b), |(lo, hi)| (lo.min(a), hi.max(b))));
+            if self.how.repel || felt.gap >= REACHED {
+                drawn.distances.push(felt.place());
+                if felt.share > 0.0 {
+                    drawn.bounds = joined(drawn.bounds, (ijk.as_dvec3(), felt.target.point));
+                }
             }
         })?;
-        let bounds = boxes.into_iter().filter_map(|drawn| drawn.bounds).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
+        let mut bounds = leaves
+            .iter()
+            .filter_map(|drawn| drawn.bounds)
+            .fold(None, |all, (a, b)| joined(joined(all, (a, a)), (b, b)));
+        if self.draws_in_front() {
+            let mut found = Found::default();
+            found.note(leaves.iter().flat_map(|drawn| &drawn.distances));
+            bounds = found.closest.iter().fold(bounds, |all, (target, (distance, foot))| {
+                let aside = DVec3::splat(SQRT_2 * front_radius(*distance));
+                joined(joined(all, (target.as_dvec3(), *foot)), (foot - aside, foot + aside))
+            });
+        }
         Ok(bounds.map(|(lo, hi)| (lo - MARGIN, hi + MARGIN)))
+    }
+
+    /// Whether what lies around the surface point closest to a target is drawn, facing it or not.
+    fn draws_in_front(&self) -> bool {
+        self.how.tip > 0.0 && !self.how.repel
     }
 
     /// Part of what faces a target at `distance` that is near enough to it, if the surface was `nearest` away from it.
@@ -178,11 +242,12 @@ impl<'a> Pull<'a> {
         voxel_size: f64,
         ijk: IVec3,
         near: Option<Target>,
-        aims: &Aims,
+        found: &Found,
     ) -> Option<Felt> {
         let (foot, normal) = foot(sampler, voxel_size, ijk)?;
         let mut target = self.target(foot, near)?;
-        let point = target.point + aims.get(&target.point.round().as_ivec3()).copied().unwrap_or_default();
+        let voxel = target.point.round().as_ivec3();
+        let point = target.point + found.aims.get(&voxel).copied().unwrap_or_default();
         let (to, phi) = (point - foot, f64::from(sampler.trilinear(point)));
         let distance = to.length();
         let towards = if distance > 1e-6 { to / distance * phi.signum() } else { normal };
@@ -196,12 +261,18 @@ impl<'a> Pull<'a> {
             nearest
         };
         let close = if tip > 0.0 { 1.0 - ramp_between(distance, tip / 2.0, tip) } else { 0.0 };
+        let front = match found.closest.get(&voxel) {
+            Some(closest) if self.draws_in_front() => in_front(foot, closest.1, point),
+            _ => 0.0,
+        };
         let mut cosine = normal.dot(towards);
         let mut gap = phi.abs() / voxel_size;
         let faces = self.how.cut_off.weight(cosine + WINDOW) > 0.0;
         let reach = if faces && close < 1.0 { self.reach(distance, nearest) } else { 1.0 };
         let share = |cosine: f64| {
-            (reach * self.how.cut_off.weight(cosine)).max(close * ramp_between(cosine, SIDEWAYS[0], SIDEWAYS[1]))
+            let faces = reach * self.how.cut_off.weight(cosine);
+            let [sideways, forward] = [SIDEWAYS, FORWARD].map(|limits| ramp_between(cosine, limits[0], limits[1]));
+            faces.max(close * sideways).max(front * forward)
         };
         let slope = (share(cosine + WINDOW) - share(cosine - WINDOW)) / (2.0 * WINDOW);
         let aside = towards - normal * cosine;
@@ -228,8 +299,23 @@ impl<'a> Pull<'a> {
                 share = 0.0;
             }
         }
-        Some(Felt { speed: share * speed, share, travel, gap, distance, target, towards })
+        Some(Felt { speed: share * speed, share, travel, gap, distance, foot, target, towards })
     }
+}
+
+/// How far aside of the way to a target at this distance from the surface all is drawn, in voxels: what grows is a cone also where next to nothing faces the target.
+fn front_radius(distance: f64) -> f64 {
+    FRONT.max(FRONT_SLOPE * distance)
+}
+
+/// Whether a surface point is around the one that is closest to a target: 1 within [`front_radius`] of the way between the two, 0 beyond √2 of it, and twice as
+/// deep below that point.
+fn in_front(foot: DVec3, closest: DVec3, target: DVec3) -> f64 {
+    let Some(way) = (target - closest).try_normalize() else { return 1.0 };
+    let radius = front_radius(target.distance(closest));
+    let height = (foot - closest).dot(way);
+    let aside = (foot - closest - way * height).length_squared() / (radius * radius);
+    (1.0 - ramp_between(aside, 1.0, 2.0)).min(1.0 - ramp_between(-height / radius, 2.0, 3.0))
 }
 
 /// The surface point closest to a voxel, and the outward normal there.
@@ -247,10 +333,17 @@ fn foot(sampler: &mut Sampler, voxel_size: f64, ijk: IVec3) -> Option<(DVec3, DV
     Some((foot, gradient / squared.sqrt()))
 }
 
+/// A box and what it is to hold as well.
+fn joined(bounds: Option<IndexBounds>, (a, b): (DVec3, DVec3)) -> Option<IndexBounds> {
+    let (lo, hi) = bounds.unwrap_or((a, a));
+    Some((lo.min(a).min(b), hi.max(a).max(b)))
+}
+
 /// The part of a leaf that is drawn.
 #[derive(Default)]
-struct Drawn {
+struct LeafDrawn {
     bounds: Option<IndexBounds>,
+    distances: Vec<Distance>,
     /// The target of the voxel before.
     near: Option<Target>,
 }

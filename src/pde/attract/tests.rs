@@ -129,6 +129,18 @@ fn points_between_the_voxels_and_far_off_are_reached() {
 }
 
 #[test]
+fn points_off_edges_and_corners_are_reached() {
+    // Of the ground's top: by the limits hardly a voxel faces them.
+    for point in [[30.3, 0.2, 6.0], [35.0, 0.5, 5.0], [33.4, 33.1, 3.6], [30.5, 2.5, 12.5]] {
+        let point = DVec3::from_array(point);
+        let (level_set, report) = drawn(&points([point]), &Attraction::default(), Until::Rest(1000));
+        let gap = level_set.sampler().trilinear(point);
+        assert!(f64::from(gap).abs() < REACHED, "{point}: {gap} {report:?}");
+        assert_eq!((level_set.measure(&RunOptions::default()).unwrap().components, report.specks), (1, 0), "{point}");
+    }
+}
+
+#[test]
 fn a_ring_draws_a_whole_wall() {
     let at = |i: u32| {
         let angle = f64::from(i) / 60.0 * std::f64::consts::TAU;
