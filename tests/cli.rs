@@ -182,6 +182,10 @@ fn a_session() {
     desk.done(&["convert", "s.vdb", "-o", "s.ply"]);
     desk.done(&["convert", "s.ply", "-o", "s.stl"]);
     desk.done(&["render", "s.vdb", "-o", "s.png", "--size", "64x48"]);
+    // A sheet of three, two in a row.
+    desk.done(&["render", "s.vdb", "s.ply", "s.stl", "-o", "sheet.png", "--size", "64x48", "--columns", "2"]);
+    let sheet = std::fs::read(desk.path("sheet.png")).unwrap();
+    assert_eq!(sheet[16..24], [0, 0, 0, 128, 0, 0, 0, 96]);
     desk.done(&["info", "s.vdb", "--check"]);
     for name in ["p.png", "s.png"] {
         assert!(std::fs::read(desk.path(name)).unwrap().starts_with(b"\x89PNG"), "{name}");
@@ -215,6 +219,7 @@ fn operators_say_what_they_need() {
         (vec!["convert", "a.vdb", "-o", "b.vdb", "--voxel-size", "1", "--resolution", "9"], "cannot be used with"),
         (vec!["render", "a.vdb", "-o", "a.png", "--size", "0x5"], "width"),
         (vec!["render", "a.vdb", "-o", "a.jpg"], ".png"),
+        (vec!["render", "a.vdb", "-o", "a.png", "--stripes", "1"], "geodesic"),
         (vec!["compare", "a.vdb", "a.vdb", "--tolerance", "-1"], "0 or more"),
     ] {
         desk.run(&words).fails(2, &[expected]);

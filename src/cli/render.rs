@@ -1,4 +1,4 @@
-//! `render`: a picture of a level set.
+//! `render`: a picture of a level set, or of several beside each other.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -13,10 +13,11 @@ use super::{Verb, args, files};
 use crate::atomic::write_atomically;
 use crate::error::{EditError, Result};
 use crate::files::{frames, input, output};
-use crate::levelset::LevelSet;
+use crate::levelset::{Components, Field, LevelSet};
 use crate::ops::Vector;
 use crate::region::{Region, RegionPlan};
 use crate::render::{CameraSpec, ColorBy, Frame, Image, Patches, RenderOptions, UpAxis, render};
+use crate::run::RunOptions;
 
 /// The command.
 pub const VERB: Verb = Verb { name: "render", build, run };
@@ -38,8 +39,14 @@ enum Color {
 fn build(command: Command) -> Command {
     let option = |id: &'static str, value_name: &'static str| Arg::new(id).long(id).value_name(value_name);
     let command = command
-        .about("Draw a picture of a level set or mesh")
-        .arg(args::path("input").value_name("IN").required(true).help("A .vdb, a mesh, or `-`"))
+        .about("Draw a picture of a level set or mesh, or of several beside each other")
+        .arg(
+            args::path("input")
+                .value_name("IN")
+                .required(true)
+                .num_args(1..)
+                .help("A .vdb, a mesh, or `-`; several are seen by the same camera, as the frames of a sequence"),
+        )
         .arg(args::path("output").long("output").short('o').value_name("OUT.png").required(true).help("The picture"))
         .arg(
             option("color-by", "WHAT")
@@ -52,6 +59,16 @@ fn build(command: Command) -> Command {
                 .allow_hyphen_values(true)
                 .value_parser(ValueParser::new(|text: &str| text.parse::<Vector>()))
                 .help("The points on the surface from which --color-by geodesic measures"),
+        )
+        .arg(
+            option("stripes", "WIDTH")
+                .value_parser(value_parser!(f64))
+                .help("With --color-by geodesic: stripes of this width (world units) of two colours in turn"),
+        )
+        .arg(
+            option("columns", "N")
+                .value_parser(value_parser!(u32).range(1..=1000))
+                .help("With several inputs: pictures in a row of the sheet [default: all]"),
         )
         .arg(
             option("region", "SPEC")
@@ -149,6 +166,12 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         let accepted = "`--color-by geodesic` and one or more points `--from X,Y,Z` go together";
         return Err(EditError::parameter("render", "color_by", format!("{color:?}").to_lowercase(), accepted));
     }
+    let stripes = matches.get_one::<f64>("stripes").copied();
+    if let Some(width) = stripes
+        && (color != Color::Geodesic || !(width > 0.0 && width.is_finite()))
+    {
+        return Err(EditError::parameter("render", "stripes", width, "a positive width, with `--color-by geodesic`"));
+    }
     let frames = frames(&path, matches.get_one::<u32>("turntable").copied());
     if args::flag(matches, "dry-run") {
         let mut all = paths;
@@ -159,39 +182,31 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         return context.reporter.result(&value, || format!("would draw {}\n", names.join(", ")));
     }
     let mut all = paths;
+    let drawn = all.len();
     all.extend(color.other());
     let mut warnings = Vec::new();
     let inputs = input::load(&all, &input_options, &mut warnings, &context.run)?;
     warnings.iter().for_each(|warning| context.reporter.warn(warning));
-    let Some(input) = inputs.first() else { return Ok(()) };
-    let region = plan.map(|plan| plan.on(&input.level_set, &context.run)).transpose()?;
-    let components = match color {
-        Color::Component => Some(input.level_set.components(&context.run)?),
-        _ => None,
-    };
-    let distances = match color {
-        Color::Geodesic => Some(input.level_set.geodesic(&from, &context.run)?.reached()),
-        _ => None,
-    };
-    let patches = match &color {
-        Color::Patch(path) | Color::Distortion(path) => Some(Patches::read(path)?),
-        _ => None,
-    };
-    let label = |xyz: DVec3| components.as_ref()?.nearest(input.level_set.transform().world_to_index(xyz));
-    let color_by = match (&color, &distances, &patches) {
-        (Color::Component, ..) => ColorBy::Label(&label),
-        (Color::Geodesic, Some(field), _) => ColorBy::Geodesic(field),
-        (Color::Patch(_), _, Some(patches)) => ColorBy::Patches(patches),
-        (Color::Distortion(_), _, Some(patches)) => ColorBy::Distortion(patches),
-        _ => color.of(inputs.get(1).map(|input| &input.level_set), region.as_deref()),
-    };
+    let (inputs, other) = inputs.split_at(drawn.min(inputs.len()));
+    let what = What { color: &color, from, stripes, other: other.first().map(|input| &input.level_set) };
+    let subjects = inputs.iter().map(|input| what.of(&input.level_set, plan.as_ref(), &context.run));
+    let subjects: Vec<Subject> = subjects.collect::<Result<_>>()?;
+    let mut options = options.clone();
+    if subjects.len() > 1 {
+        let boxes = inputs.iter().filter_map(|input| input.level_set.world_bounds());
+        if let Some((lo, hi)) = boxes.reduce(|(a, b), (c, d)| (a.min(c), b.max(d))) {
+            options.camera.frame = Frame::Box(lo, hi);
+        }
+    } else if frames.len() > 1 {
+        options.camera.frame = Frame::Sphere;
+    }
+    let columns = matches.get_one::<u32>("columns").map_or(subjects.len(), |n| *n as usize);
     for (path, turn) in &frames {
         let mut options = options.clone();
         options.camera.azimuth += turn;
-        if frames.len() > 1 {
-            options.camera.frame = Frame::Sphere;
-        }
-        write(path, &render(&input.level_set, &color_by, &options, &context.run)?)?;
+        let images: Vec<Image> =
+            subjects.iter().map(|subject| subject.draw(&options, &context.run)).collect::<Result<_>>()?;
+        write(path, &Image::sheet(&images, columns))?;
     }
     let names: Vec<String> = frames.iter().map(|(path, _)| path.display().to_string()).collect();
     let seconds = began.elapsed().as_secs_f64();
@@ -201,7 +216,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     value.insert("outputs".into(), names.clone().into());
     value.insert("width".into(), options.width.into());
     value.insert("height".into(), options.height.into());
-    if let Some(components) = &components {
+    if let Some(components) = subjects.first().and_then(|subject| subject.components.as_ref()) {
         value.insert("components".into(), components.voxels().len().into());
     }
     value.insert("seconds".into(), seconds.into());
@@ -219,15 +234,72 @@ impl Color {
             _ => None,
         }
     }
+}
 
-    fn of<'a>(&self, other: Option<&'a LevelSet>, region: Option<&'a dyn Region>) -> ColorBy<'a> {
-        match (self, other, region) {
-            (Self::Difference(_), Some(other), _) => ColorBy::Difference(other),
-            (Self::Region, _, Some(region)) => ColorBy::Region(region),
-            (Self::Curvature, ..) => ColorBy::Curvature,
-            (Self::Normal, ..) => ColorBy::Normal,
-            _ => ColorBy::Clay,
-        }
+/// What the colours say, of any input.
+struct What<'a> {
+    color: &'a Color,
+    from: Vec<DVec3>,
+    stripes: Option<f64>,
+    other: Option<&'a LevelSet>,
+}
+
+/// An input with what its colours say.
+struct Subject<'a> {
+    level_set: &'a LevelSet,
+    color: &'a Color,
+    stripes: Option<f64>,
+    other: Option<&'a LevelSet>,
+    region: Option<Box<dyn Region>>,
+    components: Option<Components>,
+    distances: Option<Field>,
+    patches: Option<Patches>,
+}
+
+impl<'a> What<'a> {
+    fn of(&self, level_set: &'a LevelSet, plan: Option<&RegionPlan>, run: &RunOptions) -> Result<Subject<'a>> {
+        Ok(Subject {
+            level_set,
+            color: self.color,
+            stripes: self.stripes,
+            other: self.other,
+            region: plan.map(|plan| plan.on(level_set, run)).transpose()?,
+            components: (*self.color == Color::Component).then(|| level_set.components(run)).transpose()?,
+            distances: match self.color {
+                Color::Geodesic => Some(level_set.geodesic(&self.from, run)?.reached()),
+                _ => None,
+            },
+            patches: match self.color {
+                Color::Patch(path) | Color::Distortion(path) => Some(Patches::read(path)?),
+                _ => None,
+            },
+        })
+    }
+}
+
+impl Subject<'_> {
+    fn draw(&self, options: &RenderOptions, run: &RunOptions) -> Result<Image> {
+        let label = |xyz: DVec3| self.components.as_ref()?.nearest(self.level_set.transform().world_to_index(xyz));
+        let stripe = |xyz: DVec3| {
+            let (field, width) = (self.distances.as_ref()?, self.stripes?);
+            let distance = Field::trilinear(&mut field.accessor(), field.transform().world_to_index(xyz))?;
+            Some((f64::from(distance) / width) as u32 % 2)
+        };
+        let color_by = match (self.color, self.other, &self.region, &self.distances) {
+            (Color::Component, ..) => ColorBy::Label(&label),
+            (Color::Geodesic, ..) if self.stripes.is_some() => ColorBy::Label(&stripe),
+            (Color::Geodesic, .., Some(field)) => ColorBy::Geodesic(field),
+            (Color::Difference(_), Some(other), ..) => ColorBy::Difference(other),
+            (Color::Region, _, Some(region), _) => ColorBy::Region(&**region),
+            (Color::Curvature, ..) => ColorBy::Curvature,
+            (Color::Normal, ..) => ColorBy::Normal,
+            _ => match (self.color, &self.patches) {
+                (Color::Patch(_), Some(patches)) => ColorBy::Patches(patches),
+                (Color::Distortion(_), Some(patches)) => ColorBy::Distortion(patches),
+                _ => ColorBy::Clay,
+            },
+        };
+        render(self.level_set, &color_by, options, run)
     }
 }
 

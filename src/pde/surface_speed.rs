@@ -35,8 +35,9 @@ const COURANT: f64 = 0.5;
 /// Below this part of a voxel a unit of time, nothing moves.
 const AT_REST: f32 = 1e-6;
 
-/// Steps between two looks at which leaves rest. In that time nothing crosses the ring of leaves around those that move.
+/// Steps between two looks at which leaves rest, and until the first one. In that time nothing crosses the ring of leaves around those that move.
 const SURVEY_EVERY: u32 = 10;
+const FIRST_SURVEY: u32 = 4;
 
 /// Parts of a voxel: what a surface at rest moves at most between two looks, whatever the time, since renormalisation shifts it to and fro.
 const SMALLEST_MOVE: f64 = 3e-4;
@@ -48,6 +49,11 @@ const WORTH_A_PART: f64 = 0.8;
 pub trait SurfaceSpeed: Sync {
     /// Writes F (world units a unit of time, positive outwards) of the voxels of a leaf, and sums up what is wanted of the surface there.
     fn of_leaf(&self, leaf: &LeafSurface<'_>, speed: &mut LeafValues) -> Tally;
+
+    /// Whether F may be other than 0 in the leaf whose first voxel is `origin`; where not, the surface is not looked for.
+    fn acts_on(&self, _origin: IVec3, _background: f32) -> bool {
+        true
+    }
 }
 
 /// Sums over the surface, of what a speed measures there.
@@ -105,6 +111,28 @@ pub struct Foot {
 }
 
 impl LeafSurface<'_> {
+    /// The voxels that move.
+    pub fn moving(&self) -> LeafMask {
+        self.moving
+    }
+
+    /// Of these, the ones less than half a voxel from the surface: they stand for it.
+    pub fn beside(&self) -> LeafMask {
+        let mut beside = LeafMask::EMPTY;
+        self.moving.iter().filter(|&at| self.depth.0[at].abs() < 0.5).for_each(|at| beside.set(at, true));
+        beside
+    }
+
+    /// Unit normals in index axes, an axis each; 0 where the field is flat. Of the rows that have a moving voxel.
+    pub fn normals(&self) -> &[LeafValues; 3] {
+        self.normal
+    }
+
+    /// How far voxels are from the surface along the normal, in voxels; negative inside. Of the rows that have a moving voxel.
+    pub fn depths(&self) -> &LeafValues {
+        self.depth
+    }
+
     /// The voxels that move, and the surface points nearest to them.
     pub fn feet(&self) -> impl Iterator<Item = Foot> + '_ {
         self.moving.iter().map(|offset| {
@@ -193,7 +221,8 @@ impl Rest {
     fn limit(&self, steps: u32, time: f64, voxel_size: f64) -> Option<f64> {
         let (_, then, begun) = self.before.as_ref()?;
         let passed = (self.slowest * (time - begun)).max(SMALLEST_MOVE * voxel_size);
-        (steps >= then + SURVEY_EVERY).then_some(passed)
+        let wait = if *then == 0 { FIRST_SURVEY } else { SURVEY_EVERY };
+        (steps >= then + wait).then_some(passed)
     }
 
     /// How far φ of a leaf has moved near the surface.
@@ -255,19 +284,19 @@ impl Motion for Moving<'_> {
                         Some(_) => grid.mask(id),
                         None => tracker.domain.moving(id, grid.mask(id)),
                     };
-                    dispatch(Feet { tracker, id, moving, halo: &mut halo, normal: &mut normal, depth: &mut depth });
-                    let leaf = LeafSurface {
-                        origin: grid.origin(id),
-                        background: grid.background(),
-                        moving,
-                        normal: &normal,
-                        depth: &depth,
-                    };
+                    let (origin, background) = (grid.origin(id), grid.background());
                     let speed = &mut speed[PageLeaves::slot(id)];
+                    let moved = if limit.is_some() { rest.moved(grid, id) } else { 0.0 };
+                    if !source.acts_on(origin, background) {
+                        speed.0.fill(0.0);
+                        found.push(OfLeaf { id, origin, tally: Tally::default(), fastest: 0.0, moved });
+                        return;
+                    }
+                    dispatch(Feet { tracker, id, moving, halo: &mut halo, normal: &mut normal, depth: &mut depth });
+                    let leaf = LeafSurface { origin, background, moving, normal: &normal, depth: &depth };
                     let tally = source.of_leaf(&leaf, speed);
                     let fastest = moving.iter().map(|at| speed.0[at].abs()).fold(0.0, f32::max);
-                    let moved = if limit.is_some() { rest.moved(grid, id) } else { 0.0 };
-                    found.push(OfLeaf { id, origin: leaf.origin, tally, fastest, moved });
+                    found.push(OfLeaf { id, origin, tally, fastest, moved });
                 });
             }
             found

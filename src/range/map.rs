@@ -38,12 +38,14 @@ impl Projection {
             Self::Spherical { first, step } => {
                 let range = p.length();
                 let mut angles = DVec2::new(p.y.atan2(p.x), (p.z / range.max(f64::MIN_POSITIVE)).asin()) - first;
-                // The turn at which the pixels begin may lie anywhere.
-                let turn = std::f64::consts::TAU;
+                // The turn at which the pixels begin may lie anywhere; it is that from half a pixel before the first one on.
+                let (turn, half) = (std::f64::consts::TAU, step.x / 2.0);
+                angles.x += half;
                 angles.x -= turn * (angles.x / turn).floor();
                 if step.x < 0.0 {
                     angles.x -= turn;
                 }
+                angles.x -= half;
                 (range > 0.0).then(|| (angles / step, range))
             }
         }
@@ -63,14 +65,6 @@ impl Projection {
         }
     }
 
-    /// The direction of the ray to a point, in the scanner's frame.
-    pub fn direction(&self, p: DVec3) -> DVec3 {
-        match self {
-            Self::Orthographic { .. } => DVec3::NEG_Z,
-            Self::Pinhole { .. } | Self::Spherical { .. } => p.normalize_or_zero(),
-        }
-    }
-
     /// Distance between neighbouring pixels at a range.
     pub fn pixel_size(&self, range: f64) -> f64 {
         match *self {
@@ -81,7 +75,7 @@ impl Projection {
     }
 
     /// Pixels a unit of area square to the ray at a range, up to a constant: what a measurement there weighs in the integral over pixels.
-    fn density(&self, p: DVec3, range: f64) -> f64 {
+    pub(super) fn density(&self, p: DVec3, range: f64) -> f64 {
         match *self {
             Self::Orthographic { .. } => 1.0,
             Self::Spherical { .. } => 1.0 / (range * range),
@@ -128,26 +122,6 @@ pub struct RangeMap {
     pub noise: Option<f64>,
     /// What rays without a measurement say.
     pub background: Background,
-}
-
-/// What a map says of a point in space.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Seen {
-    /// Nothing: it is outside of the picture, or the ray has no answer.
-    No,
-    /// The ray through it found nothing.
-    Nothing,
-    /// A surface along the ray.
-    Surface {
-        /// Signed distance along the ray: positive in front of the measured surface.
-        distance: f64,
-        /// Confidence.
-        weight: f64,
-        /// Density of pixels, up to a constant that all maps share.
-        density: f64,
-        /// Unit direction of the ray in the world.
-        direction: DVec3,
-    },
 }
 
 /// What a map says of all points of a ball.
@@ -243,48 +217,6 @@ impl RangeMap {
         self.ranges.get(v * self.width + u).copied().filter(|_| u < self.width).unwrap_or(f32::NAN)
     }
 
-    /// What it says of a point of the world.
-    pub fn look(&self, to_scanner: &DAffine3, xyz: DVec3) -> Seen {
-        let p = to_scanner.transform_point3(xyz);
-        let Some((pixel, range)) = self.projection.project(p) else { return Seen::No };
-        let limit = DVec2::new(self.width as f64 - 0.5, self.height as f64 - 0.5);
-        if !(pixel.cmpgt(DVec2::splat(-0.5)).all() && pixel.cmplt(limit).all()) {
-            return Seen::No;
-        }
-        let Some((measured, weight)) = self.interpolated(pixel) else {
-            return match self.background {
-                Background::Empty => Seen::Nothing,
-                Background::Unknown => Seen::No,
-            };
-        };
-        Seen::Surface {
-            distance: measured - range,
-            weight,
-            density: self.projection.density(p, range),
-            direction: self.pose.transform_vector3(self.projection.direction(p)),
-        }
-    }
-
-    /// Range and confidence between pixels: bilinear where all four pixels around are valid, else those of the nearest one.
-    fn interpolated(&self, pixel: DVec2) -> Option<(f64, f64)> {
-        let clamped = pixel.clamp(DVec2::ZERO, DVec2::new(self.width as f64 - 1.0, self.height as f64 - 1.0));
-        let (u, v) = (clamped.x as usize, clamped.y as usize);
-        let at = v * self.width + u;
-        if u + 1 < self.width && v + 1 < self.height {
-            let corners = [at, at + 1, at + self.width, at + self.width + 1];
-            let r = corners.map(|c| f64::from(self.ranges[c]));
-            let sum = r[0] + r[1] + r[2] + r[3];
-            if !sum.is_nan() {
-                let (s, t) = (clamped.x - u as f64, clamped.y - v as f64);
-                let mix = |q: [f64; 4]| (1.0 - t) * ((1.0 - s) * q[0] + s * q[1]) + t * ((1.0 - s) * q[2] + s * q[3]);
-                return Some((mix(r), mix(corners.map(|c| f64::from(self.weights[c])))));
-            }
-        }
-        let (u, v) = ((clamped.x + 0.5) as usize, (clamped.y + 0.5) as usize);
-        let range = self.range(u, v);
-        (!range.is_nan()).then(|| (f64::from(range), f64::from(self.weights[v * self.width + u])))
-    }
-
     /// World positions of the measurements, every `step`-th along both sides.
     pub fn points(&self, step: usize) -> impl Iterator<Item = DVec3> + '_ {
         let step = step.max(1);
@@ -302,23 +234,24 @@ impl RangeMap {
         self.ranges.iter().filter(|r| !r.is_nan()).count()
     }
 
-    /// Mean density of its pixels where they measured; `None` without any, or where rays are parallel and it says nothing.
+    /// Mean density of its pixels over what they measured, each pixel standing for 1/density of it; `None` without any, or where rays are parallel and it says
+    /// nothing.
     pub fn mean_density(&self) -> Option<f64> {
         if self.projection.is_parallel() {
             return None;
         }
-        let (mut sum, mut count) = (0.0, 0.0);
+        let (mut area, mut count) = (0.0, 0.0);
         for v in (0..self.height).step_by(4) {
             for u in (0..self.width).step_by(4) {
                 let range = f64::from(self.range(u, v));
                 if range > 0.0 {
                     let p = self.projection.point(DVec2::new(u as f64, v as f64), range);
-                    sum += self.projection.density(p, range);
+                    area += 1.0 / self.projection.density(p, range);
                     count += 1.0;
                 }
             }
         }
-        (count > 0.0).then(|| sum / count)
+        (count > 0.0).then(|| count / area)
     }
 
     /// Standard deviation of the noise, from second differences along rows: 1.48 times the median of their size, over √6.
@@ -350,14 +283,17 @@ impl RangeMap {
                 return centre;
             }
             let reach = ((3.0 * sigma).ceil() as i64).min(REACH);
+            let along: [f64; REACH as usize + 1] = std::array::from_fn(|k| match k as i64 <= reach {
+                true => (-0.5 * (k * k) as f64 / (sigma * sigma)).exp(),
+                false => 0.0,
+            });
             let (u, v) = (at as i64 % width, at as i64 / width);
             let (mut sum, mut weights) = (0.0, 0.0);
             for b in (v - reach).max(0)..=(v + reach).min(height - 1) {
                 for a in (u - reach).max(0)..=(u + reach).min(width - 1) {
                     let difference = f64::from(ranges[(b * width + a) as usize]) - f64::from(centre);
                     if difference.abs() <= jump {
-                        let squared = ((a - u) * (a - u) + (b - v) * (b - v)) as f64;
-                        let weight = (-0.5 * squared / (sigma * sigma)).exp();
+                        let weight = along[(a - u).unsigned_abs() as usize] * along[(b - v).unsigned_abs() as usize];
                         sum += weight * difference;
                         weights += weight;
                     }

@@ -15,6 +15,7 @@ mod files;
 mod map;
 mod png;
 mod ptx;
+mod sight;
 mod stanford;
 #[cfg(test)]
 mod tests;
@@ -22,4 +23,5 @@ mod toml;
 mod turning;
 
 pub use files::RangeSet;
-pub use map::{Around, Background, MOST_PIXELS, Projection, RangeMap, Seen, draw_parallel, is_rigid};
+pub use map::{Around, Background, MOST_PIXELS, Projection, RangeMap, draw_parallel, is_rigid};
+pub use sight::Sight;

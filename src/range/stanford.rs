@@ -1,7 +1,9 @@
 //! Scans of the Stanford repository: PLY files with a grid of points (`range_grid`), and `.conf` lists of their poses.
 //!
-//! A line `bmesh file tx ty tz qx qy qz qw` places a scan: p_world = R(q)ᵀ p + t. The scanner moves along x and looks along −z, in a fan of a few
-//! degrees along y that is taken for parallel: points are drawn where they were measured, only the rays are up to a tenth off.
+//! A line `bmesh file tx ty tz qx qy qz qw` places a scan: p_world = R(q)ᵀ p + t. The scanner moves along x and looks along −z, in a fan along y. In the scans of
+//! the bunny the rows of a grid keep x to 0.13 mm, the width of their interlacing, and y goes with z by 0.014 to 0.083: a fan from 1.2 m away, whose rays are
+//! up to 5 degrees off the axis. It is taken for parallel: points are drawn where they were measured, and the rays only say from where a point was
+//! seen and how far from it a voxel is. Both matter near the surface alone, where a distance along a ray errs by less than 0.4 %.
 
 use std::path::Path;
 

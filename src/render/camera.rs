@@ -4,7 +4,7 @@
 //! likewise at the other sides (x right, y up, z towards the camera at c). So the largest value over the points at each
 //! side gives the closest camera that cuts nothing, in one pass and without iteration.
 
-use glam::{DVec3, IVec3};
+use glam::{DVec2, DVec3, IVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::grid::offset_to_local;
@@ -102,6 +102,15 @@ impl Camera {
         let u = (2.0 * x / self.size[0] - 1.0) * self.tangent[0];
         let v = (1.0 - 2.0 * y / self.size[1]) * self.tangent[1];
         (self.right * u + self.up * v - self.back).normalize()
+    }
+
+    /// Where in the picture (pixels from the top left corner) a point is seen; `None` beside and behind the eye.
+    pub fn pixel_of(&self, xyz: DVec3) -> Option<DVec2> {
+        let from_eye = xyz - self.eye;
+        let depth = -from_eye.dot(self.back);
+        let u = from_eye.dot(self.right) / depth / self.tangent[0];
+        let v = from_eye.dot(self.up) / depth / self.tangent[1];
+        (depth > 1e-9).then(|| DVec2::new((u + 1.0) * self.size[0], (1.0 - v) * self.size[1]) / 2.0)
     }
 
     /// Edge of a pixel at distance 1.

@@ -98,10 +98,20 @@ impl Cursor<'_> {
 
     /// [`cell`](Self::cell) where a corner lies beyond the leaf.
     fn border_cell(&self, local: IVec3) -> [f32; 8] {
+        // The leaf of a corner is found once for all corners in it: mostly two.
+        let beyond = local.cmpeq(IVec3::splat(LEAF_DIM - 1)).bitmask() as usize;
+        let mut leaves = [self.id; 8];
+        for (side, leaf) in leaves.iter_mut().enumerate().skip(1) {
+            // Bits x, y, z as those of the mask.
+            if side & !beyond == 0 {
+                *leaf = self.beside(13 + (side & 1) * 9 + (side >> 1 & 1) * 3 + (side >> 2));
+            }
+        }
         let mut corners = [0.0; 8];
         for (c, corner) in corners.iter_mut().enumerate() {
-            let c = c as i32;
-            *corner = self.tap(local + IVec3::new(c >> 2, c >> 1 & 1, c & 1));
+            let at = local + IVec3::new(c as i32 >> 2, c as i32 >> 1 & 1, c as i32 & 1);
+            let side = (c >> 2 | c & 2 | (c & 1) << 2) & beyond;
+            *corner = self.field.grid.values(leaves[side]).0[leaf_offset(at)];
         }
         corners
     }

@@ -41,6 +41,11 @@ impl Ray {
         self.origin + self.direction * t
     }
 
+    /// The ray without its first part.
+    pub fn after(&self, t: f64) -> Self {
+        Self { origin: self.at(t), ..*self }
+    }
+
     /// Entry and exit of a box.
     #[inline(always)]
     fn crossing(&self, (lo, hi): (DVec3, DVec3)) -> (f64, f64) {
@@ -98,7 +103,7 @@ impl Scene<'_> {
             let mut faces = (cell.as_dvec3() + ahead - ray.origin) * ray.inverse;
             while t < t_end && self.skip.block(cell) == block {
                 let corners = cursor.cell(cell);
-                let (low, high) = corners.iter().fold((f32::MAX, f32::MIN), |(l, h), &c| (l.min(c), h.max(c)));
+                let (low, high) = extremes(&corners);
                 let exit = faces.min_element();
                 if low < 0.0 && high >= 0.0 {
                     let corners = corners.map(f64::from);
@@ -145,6 +150,18 @@ impl Scene<'_> {
         }
         None
     }
+}
+
+/// The least and the largest of the corners. In pairs: the inner loop waits for it.
+#[inline(always)]
+fn extremes(corners: &[f32; 8]) -> (f32, f32) {
+    let less = |a: f32, b: f32| if a < b { a } else { b };
+    let more = |a: f32, b: f32| if a > b { a } else { b };
+    let [a, b, c, d, e, f, g, h] = *corners;
+    (
+        less(less(less(a, b), less(c, d)), less(less(e, f), less(g, h))),
+        more(more(more(a, b), more(c, d)), more(more(e, f), more(g, h))),
+    )
 }
 
 /// Trilinear value at `part` of a cell.

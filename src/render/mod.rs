@@ -11,6 +11,7 @@ mod march;
 mod occlusion;
 mod patches;
 mod png;
+mod screen;
 mod shade;
 mod skip;
 mod tile;
@@ -34,6 +35,7 @@ use camera::{Camera, points_to_frame};
 use field::Field;
 use march::Scene;
 use occlusion::Light;
+use screen::Screen;
 use shade::Lights;
 use skip::SkipMap;
 use tile::{Picture, TILE};
@@ -179,12 +181,14 @@ pub fn render(
     run.check(OPERATION)?;
     let &RenderOptions { width, height, .. } = options;
     let pixels = u64::from(width) * u64::from(height);
-    // The tiles and the picture that they are copied to.
-    run.reserve(OPERATION, pixels * 8 + SkipMap::MAX_BYTES, "take a smaller picture")?;
+    // The tiles, the picture that they are copied to, and where rays begin.
+    run.reserve(OPERATION, pixels * 12 + SkipMap::MAX_BYTES, "take a smaller picture")?;
 
     let transform = *level_set.transform();
     let points = points_to_frame(level_set, options.camera.frame);
     let camera = Camera::framing(&options.camera, &points, width, height);
+    let middle = points.iter().map(|p| p.0).sum::<DVec3>() / points.len().max(1) as f64;
+    let footprint = middle.distance(camera.eye) * camera.pixel() / level_set.voxel_size();
     let skip = SkipMap::new(level_set.grid());
     let extent = skip.as_ref().map_or(0.0, |s| (s.bounds().1 - s.bounds().0).max_element());
     let lights = Lights::around(&camera);
@@ -202,6 +206,7 @@ pub fn render(
     };
     let range = options.range.unwrap_or(default_range);
     let picture = Picture {
+        screen: skip.as_ref().map(|skip| Screen::new(skip, &camera, &transform, width, height)),
         scene: skip.map(|skip| Scene { field: Field::new(level_set.grid(), level_set.voxel_size()), skip }),
         camera,
         transform,
@@ -209,6 +214,7 @@ pub fn render(
         light,
         color_by,
         range: DataRange(range),
+        spacing: occlusion::spacing(footprint),
         antialias: options.antialias,
         width,
         height,

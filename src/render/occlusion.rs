@@ -2,17 +2,18 @@
 //!
 //! Every pixel of a 4×4 pattern follows its own few rays of one fixed set, stratified over the hemisphere by the cosine; a
 //! filter over 5×5 pixels with half weights at its border then gives every pixel the mean of the whole set
-//! (interleaved sampling, Keller and Heidrich 2001). Pixels on another part of the surface do not count.
+//! (interleaved sampling, Keller and Heidrich 2001). Pixels on another part of the surface do not count. Where pixels are smaller than voxels, every second or
+//! fourth one along a side follows rays: the filter reaches over as many of them.
 
 use glam::DVec3;
 
 use super::field::Cursor;
 use super::march::{Ray, Scene, Start};
 
-/// Edge of the interleaved pattern in pixels.
+/// Edge of the interleaved pattern in pixels that follow rays.
 const PATTERN: usize = 4;
-/// Pixels that the filter reaches to each side.
-pub(super) const REACH: usize = PATTERN / 2;
+/// How many of these the filter reaches to each side.
+pub(super) const REACH: i64 = PATTERN as i64 / 2;
 /// Rays start this far (voxels) off the surface: the facets of the trilinear surface shall not shadow each other.
 const LIFT: f64 = 0.35;
 /// Half-angle of the key light's disc: a large studio light.
@@ -107,9 +108,18 @@ impl FilterPoint {
     }
 }
 
-/// Weight of a pixel `offset` away along one axis: half at the border of the filter.
-pub(super) fn filter_weight(offset: i64) -> f64 {
-    if offset.unsigned_abs() as usize == REACH { 0.5 } else { 1.0 }
+/// Weight of a pixel `offset` away along one axis: half at the border of a filter.
+pub(super) fn filter_weight(offset: i64, border: i64) -> f64 {
+    if offset.abs() == border { 0.5 } else { 1.0 }
+}
+
+/// Pixels from one that follows rays to the next, for pixels with an edge of so many voxels: what a voxel holds is not looked for twice.
+pub(super) fn spacing(footprint: f64) -> i64 {
+    match footprint {
+        f if f > 0.6 => 1,
+        f if f > 0.3 => 2,
+        _ => 4,
+    }
 }
 
 #[cfg(test)]

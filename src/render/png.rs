@@ -35,6 +35,23 @@ impl Image {
         Self { width: images.iter().map(|image| image.width).sum(), height, rgba8 }
     }
 
+    /// Pictures in rows of `columns`, a contact sheet. Places without a picture have the colour of the first one's corner.
+    pub fn sheet(images: &[Self], columns: usize) -> Self {
+        let columns = columns.max(1);
+        let rows: Vec<Self> = images.chunks(columns).map(Self::side_by_side).collect();
+        let (width, height) =
+            (rows.iter().map(|row| row.width).max().unwrap_or(0), rows.iter().map(|row| row.height).sum());
+        let corner = images.first().and_then(|image| image.pixel(0, 0)).unwrap_or_default();
+        let mut rgba8 = Vec::with_capacity(width as usize * height as usize * 4);
+        for row in &rows {
+            for pixels in row.rgba8.chunks_exact((row.width as usize * 4).max(4)) {
+                rgba8.extend_from_slice(pixels);
+                rgba8.extend(std::iter::repeat_n(corner, (width - row.width) as usize).flatten());
+            }
+        }
+        Self { width, height, rgba8 }
+    }
+
     /// Writes the picture as PNG, marked as sRGB; without an alpha channel where every pixel is opaque.
     pub fn write_png(&self, to: impl Write) -> io::Result<()> {
         let opaque = self.rgba8.chunks_exact(4).all(|p| p[3] == u8::MAX);
@@ -84,6 +101,9 @@ mod tests {
     #[test]
     fn rows_stay_together() {
         let of = |value: u8, width: u32| Image { width, height: 2, rgba8: vec![value; width as usize * 8] };
+        let sheet = Image::sheet(&[of(1, 2), of(1, 2), of(1, 2)], 2);
+        assert_eq!((sheet.width, sheet.height, sheet.rgba8.len()), (4, 4, 64));
+        assert_eq!(sheet.pixel(3, 3), of(1, 2).pixel(0, 0));
         let both = Image::side_by_side(&[of(1, 2), of(2, 1)]);
         assert_eq!((both.width, both.height), (3, 2));
         assert_eq!(both.pixel(1, 1), Some([1; 4]));

@@ -84,6 +84,17 @@ impl SkipMap {
         (self.lo.as_dvec3() * edge, (self.lo + self.size).as_dvec3() * edge)
     }
 
+    /// The boxes of the blocks that may hold surface, in index space.
+    pub fn blocks(&self) -> impl Iterator<Item = (DVec3, DVec3)> + '_ {
+        let edge = f64::from(1u32 << self.shift);
+        let row = self.size.z;
+        self.distance.iter().enumerate().filter(|(_, distance)| **distance == 0).map(move |(n, _)| {
+            let n = n as i32;
+            let lo = (self.lo + IVec3::new(n / (self.size.y * row), n / row % self.size.y, n % row)).as_dvec3() * edge;
+            (lo, lo + edge)
+        })
+    }
+
     /// The block of a cell.
     #[inline(always)]
     pub fn block(&self, cell: IVec3) -> IVec3 {

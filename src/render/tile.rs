@@ -9,6 +9,7 @@ use super::camera::Camera;
 use super::field::Cursor;
 use super::march::{Ray, Scene, Start};
 use super::occlusion::{self, FilterPoint, Light, REACH, Visibility, filter_weight};
+use super::screen::Screen;
 use super::shade::{self, Lights};
 use super::vertices::sequential;
 use super::{ColorBy, DataRange};
@@ -17,8 +18,6 @@ use crate::levelset::Sampler;
 
 /// Edge of a tile in pixels. The rim costs an eighth more work.
 pub(super) const TILE: u32 = 96;
-/// Pixels around a tile that are computed too: one for the search for edges, the filter's reach around that.
-const RIM: i64 = REACH as i64 + 1;
 /// A step of colour between neighbours that counts as an edge, linear.
 const COLOR_EDGE: f64 = 0.06;
 /// Cosine between the normals of neighbours below which there is an edge.
@@ -27,12 +26,15 @@ const NORMAL_EDGE: f64 = 0.96;
 /// All that the tiles share.
 pub(super) struct Picture<'a> {
     pub scene: Option<Scene<'a>>,
+    pub screen: Option<Screen>,
     pub camera: Camera,
     pub transform: Transform,
     pub lights: Lights,
     pub light: Light,
     pub color_by: &'a ColorBy<'a>,
     pub range: DataRange,
+    /// Pixels from one that follows rays to the lights to the next, along either side.
+    pub spacing: i64,
     /// Samples along the side of a pixel at edges.
     pub antialias: u32,
     pub width: u32,
@@ -61,12 +63,32 @@ struct Readers<'a> {
     distances: Option<(Accessor<'a>, &'a Transform)>,
 }
 
+/// The pixels whose visibility is averaged: up to `reach` away, `spacing` apart; those `border` away count half.
+struct Around {
+    at: (i64, i64),
+    reach: i64,
+    spacing: i64,
+    border: i64,
+}
+
+/// What changes between a pixel and its neighbours.
+#[derive(Clone, Copy, PartialEq)]
+enum Edge {
+    None,
+    /// The orientation or the colour of one surface.
+    Crease,
+    /// The surface.
+    Outline,
+}
+
 /// Pixels of a tile with its rim.
 struct Window {
     x: i64,
     y: i64,
     columns: usize,
     rows: usize,
+    /// Pixels around the tile.
+    rim: i64,
 }
 
 impl Window {
@@ -76,7 +98,7 @@ impl Window {
 
     /// The pixels within `reach` of the tile, with their indices.
     fn pixels(&self, reach: i64) -> impl Iterator<Item = (i64, i64, usize)> + '_ {
-        let skip = RIM - reach;
+        let skip = self.rim - reach;
         let (x0, y0) = (self.x + skip, self.y + skip);
         let (x1, y1) = (self.x + self.columns as i64 - skip, self.y + self.rows as i64 - skip);
         (y0..y1).flat_map(move |y| (x0..x1).map(move |x| (x, y, self.index(x, y))))
@@ -92,12 +114,17 @@ impl Picture<'_> {
                 .flat_map(|y| (x0..x0 + width).flat_map(move |x| self.encode(x, y, DVec4::ZERO)))
                 .collect();
         };
+        // One pixel for the search for edges, the filter's reach around that.
+        let (reach, spacing) = (REACH * self.spacing, self.spacing);
+        let rim = reach + 1;
         let window = Window {
-            x: i64::from(x0) - RIM,
-            y: i64::from(y0) - RIM,
-            columns: width as usize + 2 * RIM as usize,
-            rows: height as usize + 2 * RIM as usize,
+            x: i64::from(x0) - rim,
+            y: i64::from(y0) - rim,
+            columns: width as usize + 2 * rim as usize,
+            rows: height as usize + 2 * rim as usize,
+            rim,
         };
+        let lit = |x: i64, y: i64| x.rem_euclid(spacing) == 0 && y.rem_euclid(spacing) == 0;
         let mut readers = Readers {
             cursor: scene.field.cursor(),
             other: match self.color_by {
@@ -110,29 +137,47 @@ impl Picture<'_> {
             },
         };
         let centre = DVec2::splat(0.5);
-        let hits: Vec<Option<Hit>> =
-            window.pixels(RIM).map(|(x, y, _)| self.cast(scene, &mut readers, pixel(x, y) + centre)).collect();
-        let raw: Vec<Visibility> = window
-            .pixels(RIM)
-            .map(|(x, y, i)| {
-                hits[i].map_or(Visibility::default(), |hit| {
-                    let at = (hit.point.position, hit.point.normal);
-                    occlusion::visibility(scene, &mut readers.cursor, &self.light, at, (x, y))
-                })
-            })
-            .collect();
+        let mut hits: Vec<Option<Hit>> = vec![None; window.columns * window.rows];
+        for (x, y, i) in window.pixels(rim) {
+            if lit(x, y) {
+                hits[i] = self.cast(scene, &mut readers, pixel(x, y) + centre);
+            }
+        }
+        for (x, y, i) in window.pixels(1) {
+            if !lit(x, y) {
+                hits[i] = self.cast(scene, &mut readers, pixel(x, y) + centre);
+            }
+        }
+        let mut visibility = |hit: &Hit, (x, y): (i64, i64)| {
+            let at = (hit.point.position, hit.point.normal);
+            let place = (x.div_euclid(spacing), y.div_euclid(spacing));
+            occlusion::visibility(scene, &mut readers.cursor, &self.light, at, place)
+        };
+        let mut raw = vec![Visibility::default(); hits.len()];
+        for (x, y, i) in window.pixels(rim).filter(|(x, y, _)| lit(*x, *y)) {
+            if let Some(hit) = &hits[i] {
+                raw[i] = visibility(hit, (x, y));
+            }
+        }
         let mut seen = vec![Visibility::default(); hits.len()];
         for (x, y, i) in window.pixels(1) {
             if let Some(hit) = &hits[i] {
-                seen[i] = self.mean(&window, &hits, &raw, hit, (x, y), REACH as i64).unwrap_or(raw[i]);
+                let around = Around { at: (x, y), reach, spacing, border: reach };
+                // Parts too thin for any of the pixels that follow rays.
+                seen[i] = self.mean(&window, &hits, &raw, hit, around).unwrap_or_else(|| visibility(hit, (x, y)));
             }
         }
         let mut rgba = Vec::with_capacity((width * height * 4) as usize);
         for (x, y, i) in window.pixels(0) {
-            let color = if self.antialias > 1 && self.is_edge(&window, &hits, (x, y)) {
-                self.supersample(scene, &mut readers, &window, &hits, &seen, (x, y))
-            } else {
-                hits[i].map_or(DVec4::ZERO, |hit| self.color(&hit, seen[i]).extend(1.0))
+            let samples = match self.edge(&window, &hits, (x, y)) {
+                Edge::None => 1,
+                // Both sides of a crease are there; the outline is finer than that.
+                Edge::Crease => self.antialias.div_ceil(2),
+                Edge::Outline => self.antialias,
+            };
+            let color = match samples {
+                1 => hits[i].map_or(DVec4::ZERO, |hit| self.color(&hit, seen[i]).extend(1.0)),
+                n => self.supersample(scene, &mut readers, (&window, &hits, &seen), (x, y), n),
             };
             rgba.extend(self.encode(x as u32, y as u32, color));
         }
@@ -148,7 +193,11 @@ impl Picture<'_> {
             to_index.transform_point3(self.camera.eye),
             to_index.transform_vector3(direction) * self.transform.voxel_size(),
         );
-        let t = scene.hit(&mut readers.cursor, &ray, Start::Outside, f64::INFINITY)?;
+        let start = self.screen.as_ref().map_or(0.0, |screen| screen.start(at));
+        if start.is_infinite() {
+            return None;
+        }
+        let t = start + scene.hit(&mut readers.cursor, &ray.after(start), Start::Outside, f64::INFINITY)?;
         let position = ray.at(t);
         let jet = readers.cursor.jet(position);
         let normal = jet.gradient.normalize_or(-ray.direction);
@@ -189,16 +238,18 @@ impl Picture<'_> {
         hits: &[Option<Hit>],
         values: &[Visibility],
         hit: &Hit,
-        (x, y): (i64, i64),
-        reach: i64,
+        Around { at: (x, y), reach, spacing, border }: Around,
     ) -> Option<Visibility> {
         let (mut sum, mut sky, mut key) = (0.0, 0.0, 0.0);
-        for dy in -reach..=reach {
-            for dx in -reach..=reach {
+        let first = |at: i64| -reach + (reach - at).rem_euclid(spacing);
+        for dy in (first(y)..=reach).step_by(spacing as usize) {
+            for dx in (first(x)..=reach).step_by(spacing as usize) {
                 let at = window.index(x + dx, y + dy);
                 if let Some(other) = &hits[at] {
                     let distance = hit.footprint * (dx.abs().max(dy.abs()) + 1) as f64;
-                    let weight = filter_weight(dx) * filter_weight(dy) * hit.point.affinity(&other.point, distance);
+                    let weight = filter_weight(dx, border)
+                        * filter_weight(dy, border)
+                        * hit.point.affinity(&other.point, distance);
                     sum += weight;
                     sky += weight * values[at].sky;
                     key += weight * values[at].key;
@@ -209,19 +260,27 @@ impl Picture<'_> {
     }
 
     /// Whether a pixel and its neighbours show different surfaces, orientations or colours.
-    fn is_edge(&self, window: &Window, hits: &[Option<Hit>], (x, y): (i64, i64)) -> bool {
+    fn edge(&self, window: &Window, hits: &[Option<Hit>], (x, y): (i64, i64)) -> Edge {
+        if self.antialias == 1 {
+            return Edge::None;
+        }
         let centre = &hits[window.index(x, y)];
-        (-1..=1).any(|dy| {
-            (-1..=1).any(|dx| match (centre, &hits[window.index(x + dx, y + dy)]) {
-                (None, None) => false,
+        let mut edge = Edge::None;
+        for (dx, dy) in (0..9).map(|k| (k % 3 - 1, k / 3 - 1)) {
+            match (centre, &hits[window.index(x + dx, y + dy)]) {
+                (None, None) => {}
                 (Some(a), Some(b)) => {
-                    a.normal.dot(b.normal) < NORMAL_EDGE
-                        || (a.albedo - b.albedo).abs().max_element() > COLOR_EDGE
-                        || (b.point.position - a.point.position).dot(a.point.normal).abs() > 1.5 * a.footprint
+                    if (b.point.position - a.point.position).dot(a.point.normal).abs() > 1.5 * a.footprint {
+                        return Edge::Outline;
+                    }
+                    if a.normal.dot(b.normal) < NORMAL_EDGE || (a.albedo - b.albedo).abs().max_element() > COLOR_EDGE {
+                        edge = Edge::Crease;
+                    }
                 }
-                _ => true,
-            })
-        })
+                _ => return Edge::Outline,
+            }
+        }
+        edge
     }
 
     /// The mean of a grid of samples over a pixel, premultiplied.
@@ -229,12 +288,10 @@ impl Picture<'_> {
         &self,
         scene: &Scene<'_>,
         readers: &mut Readers<'_>,
-        window: &Window,
-        hits: &[Option<Hit>],
-        seen: &[Visibility],
+        (window, hits, seen): (&Window, &[Option<Hit>], &[Visibility]),
         (x, y): (i64, i64),
+        n: u32,
     ) -> DVec4 {
-        let n = self.antialias;
         let mut sum = DVec4::ZERO;
         for k in 0..n * n {
             // Rows and columns sheared against each other, so that upright and level edges get n² steps, not n.
@@ -242,7 +299,8 @@ impl Picture<'_> {
             let side = f64::from(n);
             let offset = DVec2::new(i + (j + 0.5) / side, j + (i + 0.5) / side) / side;
             if let Some(hit) = self.cast(scene, readers, pixel(x, y) + offset) {
-                let visibility = self.mean(window, hits, seen, &hit, (x, y), 1).unwrap_or_else(|| {
+                let beside = Around { at: (x, y), reach: 1, spacing: 1, border: 2 };
+                let visibility = self.mean(window, hits, seen, &hit, beside).unwrap_or_else(|| {
                     // A part too thin for any pixel's centre.
                     let at = (hit.point.position, hit.point.normal);
                     occlusion::visibility(scene, &mut readers.cursor, &self.light, at, (x + i64::from(k), y))

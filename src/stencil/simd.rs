@@ -12,6 +12,12 @@ pub use fearless_simd::{Select, Simd, SimdBase};
 /// Sixteen values: two rows of a leaf, z fastest.
 pub type Lanes<S> = f32x16<S>;
 
+/// One number in all lanes.
+#[inline(always)]
+pub fn splat<S: Simd>(simd: S, value: f64) -> Lanes<S> {
+    Lanes::splat(simd, value as f32)
+}
+
 /// `magnitude`, negated where `sign` is below zero.
 ///
 /// In place of `copysign`, which must not be used on lanes: for AVX-512, LLVM makes a ternary logic instruction of its bit operations,

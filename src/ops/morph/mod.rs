@@ -35,7 +35,7 @@ use crate::run::RunOptions;
 use distance::TargetDistance;
 use leg::{Law, Leg};
 use pose::{Moments, Pose};
-pub use sequence::{FrameFacts, Place, Sequence, SequenceReport, TakeFrame, Ways};
+pub use sequence::{FrameFacts, Place, Sequence, SequenceReport, TakeFrame, Ways, other_units};
 
 const NAME: &str = "morph";
 

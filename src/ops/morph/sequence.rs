@@ -147,6 +147,7 @@ impl<'a> Sequence<'a> {
             let accepted = format!("{} or more, one for each shape", inputs.len());
             return Err(EditError::parameter(NAME, "frame_count", params.frame_count, accepted));
         }
+        warnings.extend(other_units(inputs, run)?);
         let shapes = on_one_lattice(inputs, &mut warnings, run)?;
         let mut prepared = Vec::new();
         for n in 0..legs {
@@ -287,6 +288,23 @@ impl<'a> Sequence<'a> {
     }
 }
 
+/// What is to be said of shapes whose sizes differ so much that one of them may be in other units. To be known before they are put on one lattice, which may
+/// take long then.
+pub fn other_units(inputs: &[LevelSet], run: &RunOptions) -> Result<Vec<String>> {
+    let sizes: Vec<f64> = inputs.iter().map(|shape| Ok(shape.measure(run)?.volume.cbrt())).collect::<Result<_>>()?;
+    let differ = |(n, pair): (usize, &[f64])| {
+        let ratio = (pair[0] / pair[1]).max(pair[1] / pair[0]);
+        (ratio > OTHER_UNITS).then(|| {
+            format!(
+                "shape {} and shape {} differ by a factor of {ratio:.0} in size: are they in the same units? `transform` scales them",
+                n + 1,
+                n + 2
+            )
+        })
+    };
+    Ok(sizes.windows(2).enumerate().filter_map(differ).collect())
+}
+
 /// All shapes on the lattice of the first.
 fn on_one_lattice(inputs: &[LevelSet], warnings: &mut Vec<String>, run: &RunOptions) -> Result<Vec<LevelSet>> {
     let Some(first) = inputs.first() else { return Ok(Vec::new()) };
@@ -318,14 +336,6 @@ fn prepare(
 ) -> Result<Prepared> {
     let names = [format!("shape {}", n + 1), format!("shape {}", n + 2)];
     let volumes = [from.measure(run)?.volume, to.measure(run)?.volume];
-    let ratio = (volumes[0] / volumes[1]).cbrt();
-    let ratio = ratio.max(1.0 / ratio);
-    if ratio > OTHER_UNITS {
-        warnings.push(format!(
-            "{} and {} differ by a factor of {ratio:.0} in size: are they in the same units?",
-            names[0], names[1]
-        ));
-    }
     if params.frame_spacing == FrameSpacing::Volume {
         leg::check_volumes(volumes[0], volumes[1])?;
     }

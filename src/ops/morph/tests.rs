@@ -1,11 +1,10 @@
 use glam::{DQuat, DVec3, IVec3};
 
 use super::*;
-use crate::grid::Transform;
-use crate::grid::offset_to_local;
+use crate::grid::{LeafValues, Transform, offset_to_local};
 use crate::ops::compare::compare;
 use crate::ops::csg::{CsgOperation, csg};
-use crate::pde::{Moment, move_surface};
+use crate::pde::{LeafSurface, Moment, SurfaceSpeed, Tally, move_surface};
 
 fn sampled(reach: i32, distance: impl Fn(DVec3) -> f64 + Sync) -> LevelSet {
     let bounds = (IVec3::splat(-reach), IVec3::splat(reach));
@@ -60,16 +59,46 @@ fn refused(inputs: &[LevelSet], params: &Morph) -> String {
     Sequence::new(inputs, params, &RunOptions::default()).err().unwrap().to_string()
 }
 
+/// The distance to a target wherever a surface goes on its way there.
+fn distance_to(from: &LevelSet, to: &LevelSet) -> TargetDistance {
+    let ((a, b), (c, d)) = (from.grid().active_bounds().unwrap(), to.grid().active_bounds().unwrap());
+    TargetDistance::new(to, (a.min(c), b.max(d)), &RunOptions::default()).unwrap()
+}
+
 /// Where a flow comes to rest.
 fn at_rest(from: &LevelSet, to: &LevelSet, steps: u32) -> LevelSet {
-    let run = RunOptions::default();
-    let ((a, b), (c, d)) = (from.grid().active_bounds().unwrap(), to.grid().active_bounds().unwrap());
-    let distance = TargetDistance::new(to, (a.min(c), b.max(d)), &run).unwrap();
+    let distance = distance_to(from, to);
     let mut surface = from.clone();
     let leg = Morph::default().leg(&distance);
     let mut control = |moment: &Moment| (moment.steps < steps).then_some(0.5);
-    move_surface(&mut surface, &leg.towards(), 0.0, 0.005, steps, &mut control, &run).unwrap();
+    move_surface(&mut surface, &leg.towards(), 0.0, 0.005, steps, &mut control, &RunOptions::default()).unwrap();
     surface
+}
+
+/// F = −b at the voxels themselves: what the sub-voxel correction mends.
+struct AtVoxels<'a>(&'a TargetDistance);
+
+impl SurfaceSpeed for AtVoxels<'_> {
+    fn of_leaf(&self, leaf: &LeafSurface<'_>, speed: &mut LeafValues) -> Tally {
+        let around = self.0.around(leaf.origin);
+        for foot in leaf.feet() {
+            speed.0[foot.offset] = -around.at((leaf.origin + offset_to_local(foot.offset)).as_dvec3()) as f32;
+        }
+        Tally::default()
+    }
+}
+
+/// Mean |∇φ| within a voxel and a half of the surface.
+fn mean_slope(level_set: &LevelSet) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    let mut sampler = level_set.sampler();
+    for &id in level_set.grid().leaves() {
+        for at in level_set.grid().mask(id).iter().filter(|&at| level_set.grid().values(id).0[at].abs() < 1.5) {
+            sum += sampler.voxel_gradient(level_set.grid().origin(id) + offset_to_local(at)).length();
+            count += 1.0;
+        }
+    }
+    sum / count
 }
 
 /// RMS distance of the zero set from a surface and mean angle of the normals to its own, in degrees.
@@ -128,6 +157,24 @@ fn concentric_spheres_pass_equal_radii() {
     }
 }
 
+/// R(t) = 15 − 7e^(−t) is 14.249 at t = 2.23; steps of a quarter end 0.044 beyond.
+#[test]
+fn the_radius_follows_its_exponential() {
+    let (from, to) = (ball(DVec3::ZERO, 8.0), ball(DVec3::ZERO, 15.0));
+    let distance = distance_to(&from, &to);
+    for (step, expected, tolerance) in [(0.25, 14.293, 0.03), (0.0625, 14.249, 0.05)] {
+        let mut surface = from.clone();
+        let mut control = |moment: &Moment| {
+            let left = 2.23 - moment.time;
+            (left > 1e-9).then_some(left.min(step))
+        };
+        let leg = Morph::default().leg(&distance);
+        move_surface(&mut surface, &leg.towards(), 0.0, 0.005, 1000, &mut control, &RunOptions::default()).unwrap();
+        println!("radius at 2.23, steps of {step}: {}", radius(&surface));
+        assert!((radius(&surface) - expected).abs() < tolerance, "{step}: {}", radius(&surface));
+    }
+}
+
 #[test]
 fn clamped_speed_moves_at_a_constant_rate() {
     let shapes = [ball(DVec3::ZERO, 8.0), ball(DVec3::ZERO, 15.0)];
@@ -149,9 +196,33 @@ fn a_cube_comes_to_rest_on_a_torus() {
     let rests = at_rest(&cube, &torus, 250);
     assert_eq!(rests.check(), []);
     let (rms, degrees) = errors(&rests, torus_distance);
-    println!("cube to torus: {rms:.4} voxel, {degrees:.3} degrees");
+    let slope = mean_slope(&rests);
+    println!("cube to torus: {rms:.4} voxel, {degrees:.3} degrees, slope {slope:.4} of {:.4}", mean_slope(&torus));
     assert!(rms < 0.02 && degrees < 0.8, "{rms} {degrees}");
+    // The reference rests at 1.01. Here the rim of the band, whose differences meet the background, flattens it; ten renormalisations bring it to 0.997.
+    assert!((0.85..1.02).contains(&slope), "{slope}");
     assert_eq!(rests.measure(&RunOptions::default()).unwrap().euler, 0);
+    // On voxels the level sets bunch up, and normals with them.
+    let distance = distance_to(&cube, &torus);
+    let mut control = |moment: &Moment| (moment.steps < 250).then_some(0.5);
+    let mut bunched = cube.clone();
+    move_surface(&mut bunched, &AtVoxels(&distance), 0.0, 0.005, 250, &mut control, &RunOptions::default()).unwrap();
+    let (rms_there, degrees_there) = errors(&bunched, torus_distance);
+    println!("on voxels: {rms_there:.4} voxel, {degrees_there:.3} degrees, slope {:.4}", mean_slope(&bunched));
+    assert!(rms_there > 1.5 * rms && degrees_there > 2.0 * degrees, "{rms_there} {degrees_there}");
+    // What is shared with the target, every 25 steps on the way.
+    let (leg, mut shared, mut surface) = (Morph::default().leg(&distance), Vec::new(), cube.clone());
+    let mut control = |moment: &Moment| {
+        if moment.steps.is_multiple_of(25) {
+            shared.push(distance.shared_volume(&LevelSet::new(moment.grid.clone(), *cube.transform())));
+        }
+        (moment.steps < 250).then_some(0.5)
+    };
+    move_surface(&mut surface, &leg.towards(), 0.0, 0.005, 250, &mut control, &RunOptions::default()).unwrap();
+    let whole = distance.shared_volume(distance.level_set());
+    println!("shared {:?}", shared.iter().map(|m| m / whole).collect::<Vec<_>>());
+    assert!(shared.len() > 4 && shared.windows(2).all(|pair| pair[1] > pair[0] - 1e-3 * whole), "{shared:?}");
+    assert!((shared.last().unwrap() / whole - 1.0).abs() < 2e-3);
     let (made, _) = frames(&[cube, torus], &Morph { frame_count: 6, ..Morph::default() });
     for pair in made.windows(2) {
         println!("shared {} rms {}", pair[1].1.shared_volume, pair[1].1.rms_voxels);
@@ -196,6 +267,8 @@ fn a_bridge_lets_a_part_that_is_not_overlapped_arrive() {
     // Without a bridge half of it is reached.
     let reached = at_rest(&shapes[0], &target, 80);
     assert!((volume(&reached) / volume(&target) - 0.5).abs() < 0.01);
+    // What overlaps nothing vanishes.
+    assert!(at_rest(&ball(DVec3::Y * 20.0, 4.0), &target, 80).is_empty());
     for (from, to) in [(0, 1), (1, 0)] {
         let pair = [shapes[from].clone(), shapes[to].clone()];
         let params = Morph { frame_count: 13, bridge: true, ..Morph::default() };

@@ -5,32 +5,35 @@ use nalgebra::{Matrix6, Vector6};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use super::forces::{Look, Term};
+use super::forces::{Term, View};
 use crate::levelset::LevelSet;
 use crate::mesh::TriangleMesh;
 use crate::range::RangeMap;
 
 /// Surfaces at a cosine below this do not tell of the ranges.
-const LEAST_COSINE: f64 = 0.3;
+const LEAST_COSINE: f32 = 0.3;
 
 /// Points of a map that its pose is found from.
 const PROBES: usize = 6000;
 
+/// How a map sees the vertices of a surface.
+pub(super) fn views(term: &Term, mesh: &TriangleMesh, normals: &[DVec3]) -> Vec<View> {
+    const CHUNK: usize = 4096;
+    let chunks = mesh.positions.par_chunks(CHUNK).zip(normals.par_chunks(CHUNK));
+    chunks.map(|(points, normals)| term.views(points, normals)).collect::<Vec<_>>().concat()
+}
+
 /// What is told of a map: the residuals of the ranges to the surface that it sees.
-pub(super) fn residuals(term: &Term, mesh: &TriangleMesh, normals: &[DVec3], estimated: Option<f64>) -> Value {
-    let of_vertex = |(p, n): (&DVec3, &DVec3)| match term.at(*p) {
-        Look::Near { distance, direction, weight } if -n.dot(direction) > LEAST_COSINE && weight > 0.0 => {
-            Some(distance)
-        }
-        _ => None,
-    };
-    let distances: Vec<f64> = mesh.positions.par_iter().zip(normals).filter_map(of_vertex).collect();
-    let count = distances.len().max(1) as f64;
-    let mean = distances.iter().sum::<f64>() / count;
-    let rms = (distances.iter().map(|d| d * d).sum::<f64>() / count).sqrt();
+pub(super) fn residuals(term: &Term, views: &[View], estimated: Option<f64>) -> Value {
+    let (mut count, mut sum, mut squares) = (0usize, 0.0, 0.0);
+    for view in views.iter().filter(|view| view.weight > 0.0 && view.cosine > LEAST_COSINE) {
+        let distance = f64::from(view.distance);
+        (count, sum, squares) = (count + 1, sum + distance, squares + distance * distance);
+    }
+    let per_vertex = 1.0 / count.max(1) as f64;
     json!({
         "name": term.map.name, "measurements": term.map.count(), "estimated_noise": estimated,
-        "seen_vertices": distances.len(), "residual_mean": mean, "residual_rms": rms,
+        "seen_vertices": count, "residual_mean": sum * per_vertex, "residual_rms": (squares * per_vertex).sqrt(),
     })
 }
 

@@ -4,7 +4,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use super::forces::Term;
+use super::forces::{Term, View};
 use crate::levelset::UnionFind;
 use crate::mesh::{TriangleMesh, linear_from_srgb8};
 
@@ -21,10 +21,52 @@ pub(super) struct Holes {
     pub largest: Vec<Value>,
 }
 
-/// A triangle is unseen if none of its corners is seen.
-pub(super) fn find(terms: &[Term], mesh: &TriangleMesh, normals: &[DVec3]) -> Holes {
-    let sees = |(p, n): (&DVec3, &DVec3)| terms.iter().any(|term| term.sees(*p, *n));
-    let seen: Vec<bool> = mesh.positions.par_iter().zip(normals).map(sees).collect();
+/// What the maps see of the vertices of a surface, map by map.
+pub(super) struct Seen {
+    seen: Vec<bool>,
+    /// Linear colours times weights, and their sum; none if no map has colours.
+    colors: Vec<([f64; 3], f64)>,
+}
+
+impl Seen {
+    /// Nothing yet.
+    pub fn new(terms: &[Term], mesh: &TriangleMesh) -> Self {
+        let vertices = mesh.positions.len();
+        let colored = terms.iter().any(|term| !term.map.colors.is_empty());
+        Self { seen: vec![false; vertices], colors: vec![([0.0; 3], 0.0); if colored { vertices } else { 0 }] }
+    }
+
+    /// Adds what a map sees.
+    pub fn add(&mut self, term: &Term, mesh: &TriangleMesh, views: &[View]) {
+        self.seen.iter_mut().zip(views).for_each(|(seen, view)| *seen |= view.is_seen());
+        if term.map.colors.is_empty() {
+            return;
+        }
+        self.colors.par_iter_mut().zip(views).zip(&mesh.positions).for_each(|(((sum, weights), view), p)| {
+            let color = Some(p).filter(|_| view.is_seen()).and_then(|p| term.map.color(&term.to_scanner, *p));
+            if let Some(color) = color {
+                let weight = f64::from(view.weight) * f64::from(view.cosine);
+                let linear = linear_from_srgb8(color);
+                *sum = std::array::from_fn(|k| sum[k] + weight * f64::from(linear[k]));
+                *weights += weight;
+            }
+        });
+    }
+
+    /// What no map sees: triangles none of whose corners is seen.
+    pub fn holes(&self, mesh: &TriangleMesh) -> Holes {
+        find(&self.seen, mesh)
+    }
+
+    /// A colour for each vertex, linear: the mean of what the maps saw there, and beyond that of the nearest vertices along the surface that are seen. `None`
+    /// if no map has colours.
+    pub fn colors(&self, mesh: &TriangleMesh) -> Option<Vec<[f32; 4]>> {
+        let of_vertex = |&(sum, weights): &([f64; 3], f64)| (weights > 0.0).then(|| sum.map(|s| (s / weights) as f32));
+        (!self.colors.is_empty()).then(|| spread(self.colors.iter().map(of_vertex).collect(), mesh))
+    }
+}
+
+fn find(seen: &[bool], mesh: &TriangleMesh) -> Holes {
     let is_seen = |v: u32| seen.get(v as usize).copied().unwrap_or(false);
     let area_of = |t: usize| {
         let [a, b, c] = mesh.corners(t);
@@ -54,22 +96,8 @@ pub(super) fn find(terms: &[Term], mesh: &TriangleMesh, normals: &[DVec3]) -> Ho
     Holes { area, part: area / whole.max(f64::MIN_POSITIVE), largest: largest.into_iter().map(told).collect() }
 }
 
-/// A colour for each vertex, linear: the mean of what the maps saw there, and beyond that of the nearest vertices along the surface that are seen. `None` if no
-/// map has colours.
-pub(super) fn colors(terms: &[Term], mesh: &TriangleMesh, normals: &[DVec3]) -> Option<Vec<[f32; 4]>> {
-    if terms.iter().all(|term| term.map.colors.is_empty()) {
-        return None;
-    }
-    let of_vertex = |(p, n): (&DVec3, &DVec3)| {
-        let (mut sum, mut weights) = ([0.0; 3], 0.0);
-        for (color, weight) in terms.iter().filter_map(|term| term.color(*p, *n)) {
-            let linear = linear_from_srgb8(color);
-            sum = std::array::from_fn(|k| sum[k] + weight * f64::from(linear[k]));
-            weights += weight;
-        }
-        (weights > 0.0).then(|| sum.map(|s| (s / weights) as f32))
-    };
-    let mut found: Vec<Option<[f32; 3]>> = mesh.positions.par_iter().zip(normals).map(of_vertex).collect();
+/// Colours of all vertices, from those of some.
+fn spread(mut found: Vec<Option<[f32; 3]>>, mesh: &TriangleMesh) -> Vec<[f32; 4]> {
     let mut beside: Vec<Vec<u32>> = vec![Vec::new(); found.len()];
     for &[a, b, c] in &mesh.triangles {
         for (v, w) in [(a, b), (b, c), (c, a)] {
@@ -90,5 +118,5 @@ pub(super) fn colors(terms: &[Term], mesh: &TriangleMesh, normals: &[DVec3]) -> 
         front = next;
     }
     let grey = [0.5; 3];
-    Some(found.into_iter().map(|color| color.unwrap_or(grey)).map(|[r, g, b]| [r, g, b, 1.0]).collect())
+    found.into_iter().map(|color| color.unwrap_or(grey)).map(|[r, g, b]| [r, g, b, 1.0]).collect()
 }

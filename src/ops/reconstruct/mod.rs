@@ -12,9 +12,14 @@
 //! Ranges are low-passed to the size of a voxel first. The first surface is the zero set of Σ c μ w D, with what any map sees through outside and the rest
 //! inside, but for what no map has in its picture; specks and bubbles are dropped. It then follows the flow. The window must be narrower than a third of the object, or maps of its far side interfere.
 //!
+//! What the maps say of a voxel is looked up once, for the first surface and for the flow; normals, and with them V, φ and ρ, are those of each step.
+//!
 //! Measured (tests): a torus of 9.4 voxels from six parallel maps with noise of a fifth of that radius is met within 0.13 voxel RMS and its volume within 1.8 %;
-//! without noise and prior within 0.08 voxel. ρ takes the surface for flat along the ray, which errs at grazing angles.
+//! without noise and prior within 0.08 voxel. From six maps of cameras at five radii the volume is within 1 % with β = 1 and 3 % too small with β = 2:
+//! a camera sees less than half of a solid, so that a point is seen by 1.6 maps in the mean instead of 2.0, and 2βH over that is the shift.
+//! ρ takes the surface for flat along the ray, which errs at grazing angles.
 
+mod first;
 mod fit;
 mod forces;
 mod holes;
@@ -31,11 +36,12 @@ use super::{Arity, Operator, Outcome, Summary, VoxelLength, WorldLength};
 use crate::error::{EditError, Result};
 use crate::grid::Transform;
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
-use crate::mesh::{Rebuild, TriangleMesh, level_set_to_mesh, rebuild};
+use crate::mesh::{Rebuild, TriangleMesh, level_set_of_mesh, rebuild};
 use crate::pde::{Moment, move_surface};
 use crate::range::{RangeMap, RangeSet};
 use crate::run::RunOptions;
-use forces::{Forces, Term, first_surface, without_specks};
+use first::without_specks;
+use forces::{Forces, Term};
 
 const NAME: &str = "reconstruct";
 
@@ -225,7 +231,7 @@ pub fn reconstruct(set: RangeSet, params: &Reconstruct, run: &RunOptions) -> Res
     }
     let (lo, hi) = (lo.floor().as_ivec3(), hi.ceil().as_ivec3());
     let mut made = None;
-    let (mut steps, mut dropped) = (0, 0);
+    let mut steps = 0;
     for round in 0..=params.refine {
         if let Some(surface) = &made {
             improve_poses(&mut maps, surface, run)?;
@@ -242,18 +248,20 @@ pub fn reconstruct(set: RangeSet, params: &Reconstruct, run: &RunOptions) -> Res
                 Term::new(map, *width, (reference / width).powi(2).clamp(0.01, 100.0), mean, thickness)
             })
             .collect();
-        let (surface, report) = follow(&terms, transform, (lo, hi), params, run)?;
-        steps += report.0;
-        dropped = report.1;
+        let followed = follow(&terms, transform, (lo, hi), params, run)?;
+        steps += followed.steps;
         if round == params.refine {
-            let mesh = level_set_to_mesh(&surface, 0.0, run)?;
+            let Followed { surface, mesh, dropped, reason, .. } = followed;
             let normals = fit::normals(&surface, &mesh);
-            let residuals: Vec<_> = terms
-                .iter()
-                .zip(&estimated)
-                .map(|(term, noise)| fit::residuals(term, &mesh, &normals, *noise))
-                .collect();
-            let holes = holes::find(&terms, &mesh, &normals);
+            let mut seen = holes::Seen::new(&terms, &mesh);
+            let mut residuals = Vec::new();
+            for (term, noise) in terms.iter().zip(&estimated) {
+                run.check(NAME)?;
+                let views = fit::views(term, &mesh, &normals);
+                residuals.push(fit::residuals(term, &views, *noise));
+                seen.add(term, &mesh, &views);
+            }
+            let holes = seen.holes(&mesh);
             if holes.part > MOSTLY_UNSEEN && params.thickness.is_none() {
                 warnings.push(format!(
                     "{:.0} % of the surface is seen by no map: it closes off what lies behind the measurements; `thickness` keeps less of that",
@@ -261,39 +269,56 @@ pub fn reconstruct(set: RangeSet, params: &Reconstruct, run: &RunOptions) -> Res
                 ));
             }
             let mut summary =
-                Summary { steps: Some(steps), stopped_because: Some(report.2.into()), warnings, ..Summary::default() };
+                Summary { steps: Some(steps), stopped_because: Some(reason.into()), warnings, ..Summary::default() };
             summary.details.insert("maps".into(), json!(residuals));
             summary.details.insert("pieces_dropped".into(), json!(dropped));
             summary.details.insert("unseen_part".into(), json!(holes.part));
             summary.details.insert("unseen_area".into(), json!(holes.area));
             summary.details.insert("holes".into(), json!(holes.largest));
-            let colors = holes::colors(&terms, &mesh, &normals);
+            let colors = seen.colors(&mesh);
             summary.colored = colors.map(|colors| Arc::new(TriangleMesh { colors: Some(colors), ..mesh }));
             return Ok(Outcome { level_set: surface, summary });
         }
-        made = Some(surface);
+        made = Some(followed.surface);
     }
-    let _ = dropped;
     Ok(Outcome { level_set: LevelSet::empty(transform, params.half_width), summary: Summary::default() })
 }
 
-/// The first surface and its flow; steps, pieces dropped and why it ended.
+/// What a flow made.
+struct Followed {
+    surface: LevelSet,
+    /// The surface as triangles.
+    mesh: TriangleMesh,
+    steps: u32,
+    /// Pieces.
+    dropped: usize,
+    /// Why it ended.
+    reason: &'static str,
+}
+
+/// The first surface and its flow.
 fn follow(
     terms: &[Term],
     transform: Transform,
     bounds: (IVec3, IVec3),
     params: &Reconstruct,
     run: &RunOptions,
-) -> Result<(LevelSet, (u32, usize, &'static str))> {
-    let first = first_surface(terms, &transform, params.half_width, bounds, run)?;
+) -> Result<Followed> {
+    let mut forces = Forces::new(terms, transform, run);
+    let first = forces.first_surface(params.half_width, bounds, run)?;
+    forces.check()?;
+    let nothing = || {
+        let accepted = "a size of which what was measured is a few voxels thick";
+        EditError::parameter(NAME, "voxel_size", transform.voxel_size(), accepted)
+    };
     if first.is_empty() {
-        let accepted = "maps of a surface that is a few voxels thick";
-        return Err(EditError::parameter(NAME, "scans", &params.scans, accepted));
+        return Err(nothing());
     }
-    let (mut surface, mut dropped) = without_specks(&first, params.least_part, run)?;
+    let (mesh, mut dropped) = without_specks(&first, params.least_part, run)?;
     drop(first);
+    // Where rays graze the surface, the mean of D is no distance.
+    let mut surface = level_set_of_mesh(mesh, &transform, params.half_width, run)?;
     let voxel_size = transform.voxel_size();
-    let forces = Forces::new(terms, transform, run);
     let (mut before, mut reason) = (f64::INFINITY, "all steps were taken");
     let mut control = |moment: &Moment| {
         if forces.has_failed() {
@@ -316,17 +341,18 @@ fn follow(
     let bending = params.beta * voxel_size * voxel_size;
     let report =
         move_surface(&mut surface, &forces, bending, RESTING * voxel_size, params.iterations, &mut control, run)?;
-    if let Some(error) = forces.failure() {
-        return Err(error);
-    }
-    let (cleaned, gone) = without_specks(&surface, params.least_part, run)?;
+    forces.check()?;
+    // Exact distances: those of the flow are too steep where it sharpens edges.
+    let (mesh, gone) = without_specks(&surface, params.least_part, run)?;
     dropped += gone;
-    // Exact distances: the flow keeps them nearly.
     let surface = match gone {
         0 => rebuild(&surface, &Rebuild::band(params.half_width), run)?,
-        _ => cleaned,
+        _ => level_set_of_mesh(mesh.clone(), &transform, params.half_width, run)?,
     };
-    Ok((surface, (report.steps, dropped, reason)))
+    if surface.is_empty() {
+        return Err(nothing());
+    }
+    Ok(Followed { surface, mesh, steps: report.steps, dropped, reason })
 }
 
 /// Brings all maps but the first nearer to a surface.

@@ -1,6 +1,7 @@
 use glam::{DAffine3, DMat3, DVec2};
 
 use super::*;
+use crate::mesh::level_set_to_mesh;
 use crate::range::{Background, Projection};
 
 const MAJOR: f64 = 1.0 / 0.0425;
@@ -89,10 +90,14 @@ fn error(level_set: &LevelSet, exact: fn(DVec3) -> f64) -> (f64, f64) {
 #[test]
 fn a_torus_from_six_noisy_maps() {
     let truth = 2.0 * std::f64::consts::PI.powi(2) * MAJOR * MINOR * MINOR;
-    // The prior shifts the surface inwards by 2βH over the maps that see it: of maps from one point those are fewer, since they do not trust their edges.
-    for (perspective, low_pass, beta, limit) in
-        [(false, 0.5, 2.0, 0.25), (true, 0.5, 1.0, 0.25), (false, 0.0, 2.0, 0.35)]
-    {
+    // The prior shifts the surface inwards by 2βH over the weight of the maps that see it. Integrated over the torus, with what hides what, that is a volume of
+    // 0.975 for the parallel maps of 2.0 in the mean and 0.970 for the perspective ones of 1.6, whose cones see less than half of the surface.
+    for (perspective, low_pass, beta, limit, volume) in [
+        (false, 0.5, 2.0, 0.25, 0.98..1.02),
+        (true, 0.5, 1.0, 0.25, 0.98..1.02),
+        (true, 0.5, 2.0, 0.25, 0.963..1.0),
+        (false, 0.0, 2.0, 0.35, 0.98..1.02),
+    ] {
         let params = Reconstruct { low_pass: VoxelLength::new(low_pass), beta, ..voxels() };
         let (level_set, summary) = made(six_maps(torus, 0.2 * MINOR, perspective), &params);
         let (rms, mean) = error(&level_set, torus);
@@ -106,7 +111,7 @@ fn a_torus_from_six_noisy_maps() {
             summary.stopped_because
         );
         assert!(rms < limit, "{rms}");
-        assert!((measures.volume / truth - 1.0).abs() < 0.02, "{}", measures.volume / truth);
+        assert!(volume.contains(&(measures.volume / truth)), "{}", measures.volume / truth);
         assert!(measures.components == 1 && measures.euler == 0, "{measures:?}");
         // The noise that is estimated from the maps is that which was put in.
         for map in summary.details["maps"].as_array().unwrap() {

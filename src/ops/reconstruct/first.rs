@@ -1,0 +1,252 @@
+//! The first surface: where the maps put it voxel by voxel, without its specks.
+
+use fearless_simd::{Select, Simd, SimdBase};
+use glam::{DVec3, IVec3};
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use super::NAME;
+use super::forces::{CUT, Forces, Sampled, Term, window};
+use crate::error::Result;
+use crate::grid::{LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, offset_to_local};
+use crate::levelset::{LevelSet, UnionFind, background, grid_of_parts};
+use crate::mesh::{TriangleMesh, level_set_to_mesh};
+use crate::range::Around;
+use crate::run::RunOptions;
+use crate::stencil::simd::{Lanes, Work, dispatch, splat};
+
+/// Sum of weights from which on the maps alone say where the first surface is.
+const ENOUGH: f64 = 0.05;
+
+/// What maps say of all voxels of a leaf at once, and the maps that must be asked voxel by voxel.
+#[derive(Default)]
+struct Votes {
+    in_front: bool,
+    empty: u32,
+    behind: u32,
+    surely_empty: bool,
+    /// Numbers of maps.
+    mixed: Vec<usize>,
+}
+
+impl Votes {
+    /// Of the voxels around a point, up to `radius` away.
+    fn new(terms: &[Term], (centre, radius): (DVec3, f64)) -> Self {
+        let mut votes = Self::default();
+        for (number, term) in terms.iter().enumerate() {
+            match term.map.look_around(&term.to_scanner, centre, radius, CUT * term.width) {
+                Around::Outside => {}
+                Around::Invalid if term.sees_through() => votes.surely_empty = true,
+                Around::Invalid => votes.empty += 1,
+                Around::InFront => votes.in_front = true,
+                Around::Behind if term.thickness.is_finite() => votes.mixed.push(number),
+                Around::Behind => votes.behind += 1,
+                Around::Mixed => votes.mixed.push(number),
+            }
+        }
+        votes
+    }
+
+    /// Inside is what maps see the surface in front of, and none sees through. What no map has in its picture is outside: it is not closed
+    /// off by anything but the end of the pictures.
+    fn is_inside(&self) -> bool {
+        !self.in_front && !self.surely_empty && self.behind > 0 && self.empty <= self.behind
+    }
+
+    /// φ₀ of a leaf, world units: Σ c μ w D / Σ c μ w where the maps say enough; else outside where a map sees through, inside where none does.
+    fn values(&self, terms: &[Term], sampled: &[Sampled], background: f32) -> LeafValues {
+        let mut values = LeafValues::default();
+        dispatch(Estimate { votes: self, terms, sampled, background, values: &mut values });
+        values
+    }
+}
+
+struct Estimate<'a> {
+    votes: &'a Votes,
+    terms: &'a [Term<'a>],
+    sampled: &'a [Sampled],
+    background: f32,
+    values: &'a mut LeafValues,
+}
+
+impl Work for Estimate<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { votes, terms, sampled, background, values } = self;
+        let (zero, one, background) = (splat(simd, 0.0), splat(simd, 1.0), Lanes::splat(simd, background));
+        for at in (0..LEAF_VOXELS).step_by(16) {
+            let (mut sum, mut weights) = (zero, zero);
+            let mut outside = splat(simd, f64::from(u8::from(votes.in_front || votes.surely_empty)));
+            let (mut empty, mut behind) = (splat(simd, votes.empty.into()), splat(simd, votes.behind.into()));
+            for Sampled { map, distance, weight } in sampled {
+                let Some(term) = terms.get(*map as usize) else { continue };
+                let distance = Lanes::from_slice(simd, &distance.0[at..at + 16]);
+                let weight = Lanes::from_slice(simd, &weight.0[at..at + 16]);
+                // Neither holds where D is no number.
+                let in_front = distance.simd_gt(zero).select(weight.simd_gt(zero).select(one, zero), zero);
+                let is_behind = distance.simd_lt(zero).select(one, zero);
+                let beyond = distance.simd_lt(splat(simd, -term.thickness)).select(one, zero);
+                let unanswered = distance.simd_eq(splat(simd, f64::INFINITY)).select(one, zero);
+                behind += is_behind - beyond;
+                outside = outside.max(in_front);
+                // A ray without an answer is a vote, not a proof.
+                match term.sees_through() {
+                    true => outside = outside.max(unanswered),
+                    false => empty += unanswered,
+                }
+                empty += beyond;
+                let weight = weight * window(simd, distance * splat(simd, 1.0 / term.width));
+                let counts = weight.simd_gt(zero);
+                sum += counts.select(weight * distance, zero);
+                weights += counts.select(weight, zero);
+            }
+            let enough = weights.simd_gt(splat(simd, ENOUGH));
+            let mean = (sum / enough.select(weights, one)).max(-background).min(background);
+            let inside = behind.simd_gt(zero).select(behind.simd_ge(empty).select(one - outside, zero), zero);
+            let sign = inside.simd_gt(zero).select(-background, background);
+            enough.select(mean, sign).store_slice(&mut values.0[at..at + 16]);
+        }
+    }
+}
+
+/// A leaf of the box.
+enum Found {
+    /// All maps say the same: whether it is inside.
+    Whole(bool),
+    Split(Box<LeafValues>),
+}
+
+impl Found {
+    fn sign(&self) -> Option<bool> {
+        match self {
+            Self::Whole(inside) => Some(*inside),
+            Self::Split(values) => values.one_sign(),
+        }
+    }
+}
+
+impl Forces<'_> {
+    /// The zero set of the data term between two voxels, closed by the box. What maps say beside it is kept for the flow.
+    pub fn first_surface(&self, half_width: f32, (lo, hi): (IVec3, IVec3), run: &RunOptions) -> Result<LevelSet> {
+        let background = background(half_width, &self.transform);
+        let (first, last) = (lo.div_euclid(IVec3::splat(LEAF_DIM)), hi.div_euclid(IVec3::splat(LEAF_DIM)));
+        let size = last - first + 1;
+        let [sx, sy, sz] = size.to_array().map(|n| n.unsigned_abs() as usize);
+        let count = sx.saturating_mul(sy).saturating_mul(sz);
+        run.reserve(
+            NAME,
+            (count as u64).saturating_mul((size_of::<Votes>() + size_of::<Found>()) as u64),
+            "take a larger voxel_size",
+        )?;
+        let task = run.task("first estimate", count as u64);
+        let place_of = |n: usize| IVec3::new((n / (sy * sz)) as i32, (n / sz % sy) as i32, (n % sz) as i32);
+        let origin_of = |n: usize| (first + place_of(n)) * LEAF_DIM;
+        // The box closes what no map does.
+        let within = |ijk: IVec3| ijk.cmpgt(lo).all() && ijk.cmplt(hi).all();
+        let votes: Vec<Votes> = (0..count)
+            .into_par_iter()
+            .with_min_len(16)
+            .map(|n| match run.is_cancelled() {
+                true => Votes::default(),
+                false => Votes::new(self.terms, self.ball(origin_of(n))),
+            })
+            .collect();
+        run.check(NAME)?;
+        let is_whole = |n: usize| within(origin_of(n)) && within(origin_of(n) + (LEAF_DIM - 1));
+        let split = |n: usize| !votes[n].mixed.is_empty() || votes[n].is_inside() && !is_whole(n);
+        let leaves = (0..count).filter(|&n| split(n)).count() as u64;
+        run.reserve(NAME, leaves.saturating_mul(5000), "take a larger voxel_size")?;
+        let of_leaf = |n: usize| {
+            task.advance(1);
+            if !split(n) || run.is_cancelled() || self.has_failed() {
+                return Found::Whole(votes[n].is_inside());
+            }
+            let origin = origin_of(n);
+            let mut sampled = Vec::with_capacity(votes[n].mixed.len());
+            for &map in &votes[n].mixed {
+                sampled.extend(self.terms.get(map).map(|term| term.sample(map, origin, &self.transform)));
+            }
+            let mut values = votes[n].values(self.terms, &sampled, background);
+            if !is_whole(n) {
+                let outside = |at: &usize| !within(origin + offset_to_local(*at));
+                (0..LEAF_VOXELS).filter(outside).for_each(|at| values.0[at] = background);
+            }
+            if values.0.iter().any(|value| value.abs() < background) {
+                self.keep(origin, sampled);
+            }
+            Found::Split(Box::new(values))
+        };
+        let found: Vec<Found> = (0..count).into_par_iter().with_min_len(4).map(of_leaf).collect();
+        run.check(NAME)?;
+        let signs: Vec<Option<bool>> = found.iter().map(Found::sign).collect();
+        let sign = |place: IVec3| match place.cmpge(IVec3::ZERO).all() && place.cmplt(size).all() {
+            true => signs[((place.x * size.y + place.y) * size.z + place.z) as usize],
+            false => Some(false),
+        };
+        // Leaves of one sign beside those of the other one are wanted as well.
+        let needed = |n: &usize| {
+            let (place, own) = (place_of(*n), signs[*n]);
+            own.is_none() || (0..27).any(|k| sign(place + IVec3::new(k / 9 - 1, k / 3 % 3 - 1, k % 3 - 1)) != own)
+        };
+        let needed: Vec<usize> = (0..count).filter(needed).collect();
+        run.reserve(NAME, needed.len() as u64 * 5000, "take a larger voxel_size")?;
+        let of_place = |n: usize| {
+            let values = match &found[n] {
+                Found::Split(values) => LeafValues::clone(values),
+                Found::Whole(true) => LeafValues::filled(-background),
+                Found::Whole(false) => LeafValues::filled(background),
+            };
+            let mut mask = LeafMask::EMPTY;
+            for (at, value) in values.0.iter().enumerate() {
+                mask.set(at, value.abs() < background);
+            }
+            (origin_of(n), values, mask)
+        };
+        let parts = vec![needed.into_par_iter().map(of_place).collect()];
+        let grid = grid_of_parts(background, &parts);
+        Ok(LevelSet::new(grid, self.transform))
+    }
+}
+/// A surface as triangles, without its small pieces: those that enclose less than a part of what the largest does are specks or bubbles. Says how many went.
+pub(super) fn without_specks(level_set: &LevelSet, part: f64, run: &RunOptions) -> Result<(TriangleMesh, usize)> {
+    let mesh = level_set_to_mesh(level_set, 0.0, run)?;
+    let pieces = pieces(&mesh);
+    let volume = |triangles: &[[u32; 3]]| {
+        let at = |v: u32| mesh.positions[v as usize];
+        let reference = triangles.first().map_or(DVec3::ZERO, |t| at(t[0]));
+        let sixth = |t: &[u32; 3]| {
+            let [a, b, c] = t.map(|v| at(v) - reference);
+            a.dot(b.cross(c)) / 6.0
+        };
+        triangles.iter().map(sixth).sum::<f64>().abs()
+    };
+    let volumes: Vec<f64> = pieces.iter().map(|piece| volume(piece)).collect();
+    let largest = volumes.iter().copied().fold(0.0, f64::max);
+    let gone = volumes.iter().filter(|volume| **volume < part * largest).count();
+    if gone == 0 {
+        return Ok((mesh, 0));
+    }
+    let kept = pieces.iter().zip(&volumes).filter(|(_, volume)| **volume >= part * largest);
+    let triangles = kept.flat_map(|(piece, _)| piece.iter().copied()).collect();
+    Ok((TriangleMesh { triangles, ..mesh }, gone))
+}
+
+/// The triangles of each connected piece, in the order of their first.
+fn pieces(mesh: &TriangleMesh) -> Vec<Vec<[u32; 3]>> {
+    let joined = UnionFind::new(mesh.positions.len());
+    for &[a, b, c] in &mesh.triangles {
+        joined.join(a, b);
+        joined.join(b, c);
+    }
+    let mut place: FxHashMap<u32, usize> = FxHashMap::default();
+    let mut pieces: Vec<Vec<[u32; 3]>> = Vec::new();
+    for triangle in &mesh.triangles {
+        let root = joined.root(triangle[0]);
+        let n = *place.entry(root).or_insert_with(|| {
+            pieces.push(Vec::new());
+            pieces.len() - 1
+        });
+        pieces[n].push(*triangle);
+    }
+    pieces
+}
