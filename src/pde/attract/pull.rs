@@ -1,6 +1,7 @@
 //! The force on a surface: what a voxel feels of the target.
 
 use std::cmp::Ordering;
+use std::f64::consts::SQRT_2;
 use std::sync::RwLock;
 
 use glam::{DVec3, IVec3};
@@ -35,6 +36,8 @@ const FAR_TIP: f64 = Attraction::TIP / 6.0;
 /// How far aside of the way from a target to the surface point closest to it, in voxels, all is drawn whose cosine lies above these, fully above the second. On the
 /// edge of a solid and on a sharp bump hardly a voxel is within the limits of the flow, and what grows from a single one breaks off.
 const FRONT: f64 = 2.5;
+/// The same for far targets, as a part of their distance: two thirds of what the limits draw of a plane.
+const FRONT_SLOPE: f64 = 0.4;
 const FORWARD: [f64; 2] = [0.0, 0.5];
 
 /// Voxels around what is drawn and what draws it that may change as well.
@@ -203,8 +206,10 @@ impl<'a> Pull<'a> {
         if self.draws_in_front() {
             let mut found = Found::default();
             found.note(leaves.iter().flat_map(|drawn| &drawn.distances));
-            bounds =
-                found.closest.iter().fold(bounds, |all, (target, (_, foot))| joined(all, (target.as_dvec3(), *foot)));
+            bounds = found.closest.iter().fold(bounds, |all, (target, (distance, foot))| {
+                let aside = DVec3::splat(SQRT_2 * front_radius(*distance));
+                joined(joined(all, (target.as_dvec3(), *foot)), (foot - aside, foot + aside))
+            });
         }
         Ok(bounds.map(|(lo, hi)| (lo - MARGIN, hi + MARGIN)))
     }
@@ -298,14 +303,19 @@ impl<'a> Pull<'a> {
     }
 }
 
-/// Whether a surface point is around the one that is closest to a target: 1 within [`FRONT`] of the way between the two, 0 beyond √2 of it, and twice as deep
-/// below that point.
+/// How far aside of the way to a target at this distance from the surface all is drawn, in voxels: what grows is a cone also where next to nothing faces the target.
+fn front_radius(distance: f64) -> f64 {
+    FRONT.max(FRONT_SLOPE * distance)
+}
+
+/// Whether a surface point is around the one that is closest to a target: 1 within [`front_radius`] of the way between the two, 0 beyond √2 of it, and twice as
+/// deep below that point.
 fn in_front(foot: DVec3, closest: DVec3, target: DVec3) -> f64 {
     let Some(way) = (target - closest).try_normalize() else { return 1.0 };
+    let radius = front_radius(target.distance(closest));
     let height = (foot - closest).dot(way);
-    let aside_squared = (foot - closest - way * height).length_squared();
-    let limit = 2.0 * FRONT * FRONT;
-    (1.0 - ramp_between(aside_squared, limit / 2.0, limit)).min(1.0 - ramp_between(-height, 2.0 * FRONT, 3.0 * FRONT))
+    let aside = (foot - closest - way * height).length_squared() / (radius * radius);
+    (1.0 - ramp_between(aside, 1.0, 2.0)).min(1.0 - ramp_between(-height / radius, 2.0, 3.0))
 }
 
 /// The surface point closest to a voxel, and the outward normal there.
