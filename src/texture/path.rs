@@ -8,8 +8,9 @@
 //! At rest the second difference is normal to the surface, so the path is a geodesic, and the points are equally far apart. A chain
 //! of n points needs about n² sweeps, so it begins with five points and gets its midpoints when it has come to rest (33 points from
 //! the start take 1600 sweeps where four levels of 60 do). A path is the shortest of those that it can be deformed into on the
-//! surface: on which side of a hole or a handle it runs is decided by where it begins, which is the straight line brought to the
-//! surface, or, where that strays too far, the shortest way over neighbouring voxels ([`over_voxels`]).
+//! surface: on which side of a hole or a handle it runs is decided by where it begins, which is a curve along the
+//! surface at both ends ([`bow`]), brought to it, or, where that strays too far or the other is shorter, the shortest way over neighbouring voxels
+//! ([`over_voxels`]).
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -29,6 +30,9 @@ const STRAIGHT: f64 = 0.01;
 /// Points of a path at first.
 const FIRST_POINTS: usize = 5;
 
+/// A path that is so many times as long as the straight line is compared with the shortest way over voxels.
+const DETOUR: f64 = 1.15;
+
 /// A straight line that projection moves farther than this part of its length is no good beginning.
 const STRAY: f64 = 1.0 / 3.0;
 
@@ -39,28 +43,56 @@ const ON_LEVEL: f64 = 0.87;
 const MOST_VOXELS: usize = 4_000_000;
 
 /// The shortest path from `a` to `b`, points of the level, in steps of at most `spacing`: the points in between and both ends, equally spaced.
-/// It begins as the chain `begin` (any number of points, on the level or not), or as the straight line. `None` where the surface ends, folds
+/// It begins as the chain `begin` (any number of points, on the level or not), or as a curve that leaves both ends along the level. `None` where the surface ends, folds
 /// or breaks on the way.
 pub(super) fn geodesic(level: Level, begin: &[DVec3], a: DVec3, b: DVec3, spacing: f64) -> Option<Vec<DVec3>> {
     let mut probe = level.probe();
-    let mut chain = vec![a];
-    chain.extend(begin);
-    chain.push(b);
-    let straight = resampled(&chain, FIRST_POINTS - 1);
-    let mut path = straight.clone();
+    let first = match begin {
+        [] => bow(&mut probe, a, b),
+        begin => [&[a], begin, &[b]].concat(),
+    };
+    let begun = resampled(&first, FIRST_POINTS - 1);
+    let mut path = begun.clone();
     let near = project_inner(&mut probe, &mut path).is_some()
-        && path.iter().zip(&straight).all(|(p, q)| p.distance(*q) < STRAY * a.distance(b));
-    if !near {
-        path = resampled(&over_voxels(&mut probe, a, b)?, 2 * FIRST_POINTS - 2);
-        project_inner(&mut probe, &mut path)?;
+        && path.iter().zip(&begun).all(|(p, q)| p.distance(*q) < STRAY * a.distance(b));
+    let first = if near { at_rest(&mut probe, path, spacing) } else { None };
+    if first.as_ref().is_some_and(|path| !begin.is_empty() || length(path) < DETOUR * a.distance(b)) {
+        return first;
     }
+    // What is long, though near, may run over the wrong side of an edge.
+    let over = over_voxels(&mut probe, a, b).and_then(|way| {
+        let mut path = resampled(&way, 2 * FIRST_POINTS - 2);
+        project_inner(&mut probe, &mut path)?;
+        at_rest(&mut probe, path, spacing)
+    });
+    [first, over].into_iter().flatten().min_by(|p, q| length(p).total_cmp(&length(q)))
+}
+
+/// A cubic curve from `a` to `b` that leaves both along the level towards the other: as a geodesic would.
+fn bow(probe: &mut Probe, a: DVec3, b: DVec3) -> Vec<DVec3> {
+    let chord = b - a;
+    let mut along = |p: DVec3| {
+        let tangent = probe.normal(p).map_or(chord, |n| chord - n * n.dot(chord));
+        tangent.normalize_or(chord.normalize_or_zero()) * chord.length()
+    };
+    let (from, to) = (along(a), along(b));
+    let place = |t: f64| {
+        let (square, cube) = (t * t, t * t * t);
+        a.lerp(b, 3.0 * square - 2.0 * cube) + from * (cube - 2.0 * square + t) + to * (cube - square)
+    };
+    let pieces = 4 * FIRST_POINTS;
+    (0..=pieces).map(|k| place(k as f64 / pieces as f64)).collect()
+}
+
+/// A path, on the level, tightened with more and more points.
+fn at_rest(probe: &mut Probe, mut path: Vec<DVec3>, spacing: f64) -> Option<Vec<DVec3>> {
     loop {
-        tighten(&mut probe, &mut path)?;
+        tighten(probe, &mut path)?;
         if length(&path) <= spacing * (path.len() - 1) as f64 {
             return Some(path);
         }
         path = with_midpoints(&path);
-        project_inner(&mut probe, &mut path)?;
+        project_inner(probe, &mut path)?;
     }
 }
 
