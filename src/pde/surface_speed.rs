@@ -365,8 +365,9 @@ struct Feet<'a> {
     depth: &'a mut LeafValues,
 }
 
-/// Bounds of |∇φ|: at the rim of the band the stencil meets ±background, and φ is the better distance there.
-const STEEPNESS: [f32; 2] = [0.8, 1.25];
+/// Bounds of |∇φ|: at the rim of the band the stencil meets ±background, and φ is the better distance there. A field that is too flat is a distance that is too
+/// short, and the flow makes it longer until it is one.
+const STEEPNESS: [f32; 2] = [1.0, 1.25];
 
 /// Below this, squared, there is no gradient.
 const FLAT_SQUARED: f32 = 1e-6;

@@ -199,8 +199,8 @@ fn a_cube_comes_to_rest_on_a_torus() {
     let slope = mean_slope(&rests);
     println!("cube to torus: {rms:.4} voxel, {degrees:.3} degrees, slope {slope:.4} of {:.4}", mean_slope(&torus));
     assert!(rms < 0.02 && degrees < 0.8, "{rms} {degrees}");
-    // The reference rests at 1.01. Here the rim of the band, whose differences meet the background, flattens it; ten renormalisations bring it to 0.997.
-    assert!((0.85..1.02).contains(&slope), "{slope}");
+    // The reference rests at 1.01; the target's own is 0.996.
+    assert!((0.98..1.02).contains(&slope), "{slope}");
     assert_eq!(rests.measure(&RunOptions::default()).unwrap().euler, 0);
     // On voxels the level sets bunch up, and normals with them.
     let distance = distance_to(&cube, &torus);
@@ -210,10 +210,10 @@ fn a_cube_comes_to_rest_on_a_torus() {
     let (rms_there, degrees_there) = errors(&bunched, torus_distance);
     println!("on voxels: {rms_there:.4} voxel, {degrees_there:.3} degrees, slope {:.4}", mean_slope(&bunched));
     assert!(rms_there > 1.5 * rms && degrees_there > 2.0 * degrees, "{rms_there} {degrees_there}");
-    // What is shared with the target, every 25 steps on the way.
+    // What is shared with the target, every ten steps on the way; it rests after some 75.
     let (leg, mut shared, mut surface) = (Morph::default().leg(&distance), Vec::new(), cube.clone());
     let mut control = |moment: &Moment| {
-        if moment.steps.is_multiple_of(25) {
+        if moment.steps.is_multiple_of(10) {
             shared.push(distance.shared_volume(&LevelSet::new(moment.grid.clone(), *cube.transform())));
         }
         (moment.steps < 250).then_some(0.5)
@@ -222,7 +222,7 @@ fn a_cube_comes_to_rest_on_a_torus() {
     let whole = distance.shared_volume(distance.level_set());
     println!("shared {:?}", shared.iter().map(|m| m / whole).collect::<Vec<_>>());
     assert!(shared.len() > 4 && shared.windows(2).all(|pair| pair[1] > pair[0] - 1e-3 * whole), "{shared:?}");
-    assert!((shared.last().unwrap() / whole - 1.0).abs() < 2e-3);
+    assert!((shared.last().unwrap() / whole - 1.0).abs() < 5e-3);
     let (made, _) = frames(&[cube, torus], &Morph { frame_count: 6, ..Morph::default() });
     for pair in made.windows(2) {
         println!("shared {} rms {}", pair[1].1.shared_volume, pair[1].1.rms_voxels);
