@@ -1,4 +1,4 @@
-//! Every parser of ours on input at random: an answer or an error, never a panic.
+//! Our parsers on input at random: an answer or an error, never a panic.
 //!
 //! Texts are strung together from the words that a parser knows, numbers at the edge of what they can be, and characters at random; files are real ones
 //! with damage. What fails is made smaller by proptest until the least that fails is found. A second each; `PARSER_SECONDS` asks for more.

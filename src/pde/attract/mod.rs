@@ -14,7 +14,7 @@
 //! that the voxels show: the flanks of a cone, whose cosine is 0, widen while it grows.
 //!
 //! On an edge or a sharp bump hardly a voxel faces a target by the limits, and what grows from a single voxel is too thin to hold. So around the surface point
-//! closest to a target, now, all within two and a half voxels of the way between the two is drawn that faces it at all.
+//! closest to a target, now, all is drawn that faces it at all and lies within two and a half voxels of the way between the two, or 0.4 of that way if this is more.
 //!
 //! F depends on the normal. So where C rises, changes of the normal travel along the surface, with the speed of the Hamiltonian F(n)|∇φ|,
 //!
