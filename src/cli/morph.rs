@@ -17,7 +17,7 @@ use crate::files::mesh_output::MeshParams;
 use crate::files::output::{self, Output};
 use crate::levelset::LevelSet;
 use crate::mesh::{TriangleMesh, transfer_attributes};
-use crate::ops::morph::{FrameFacts, Morph, Sequence, Ways, other_units};
+use crate::ops::morph::{FrameFacts, Morph, Sequence, Ways};
 use crate::ops::{Entry, find, parse};
 use crate::render::{ColorBy, Frame, Image, RenderOptions, render as draw};
 
@@ -105,12 +105,8 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let mut warnings = Vec::new();
     let inputs = input::load(&paths, &input_options, &mut warnings, &context.run)?;
     let shapes: Vec<LevelSet> = inputs.iter().map(|input| input.level_set.clone()).collect();
-    // Before the work, which may be long for shapes in other units.
-    let units = other_units(&shapes, &context.run)?;
-    warnings.iter().chain(&units).for_each(|warning| context.reporter.warn(warning));
-    let sequence = Sequence::new(&shapes, &params, &context.run)?;
-    let later = sequence.warnings().iter().filter(|warning| !units.contains(warning));
-    later.for_each(|warning| context.reporter.warn(warning));
+    warnings.iter().for_each(|warning| context.reporter.warn(warning));
+    let sequence = Sequence::new(&shapes, &params, &context.run, &mut |warning| context.reporter.warn(warning))?;
     let told = sequence.warnings().len();
     let places = sequence.places();
     let boxes = sequence.shapes().iter().filter_map(LevelSet::world_bounds);

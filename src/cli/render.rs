@@ -181,6 +181,10 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         let value = json!({ "dry_run": true, "operation": "render", "inputs": lines, "outputs": names });
         return context.reporter.result(&value, || format!("would draw {}\n", names.join(", ")));
     }
+    let patches = match &color {
+        Color::Patch(path) | Color::Distortion(path) => Some(Patches::read(path)?),
+        _ => None,
+    };
     let mut all = paths;
     let drawn = all.len();
     all.extend(color.other());
@@ -188,8 +192,8 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     let inputs = input::load(&all, &input_options, &mut warnings, &context.run)?;
     warnings.iter().for_each(|warning| context.reporter.warn(warning));
     let (inputs, other) = inputs.split_at(drawn.min(inputs.len()));
-    let what = What { color: &color, from, stripes, other: other.first().map(|input| &input.level_set) };
-    let subjects = inputs.iter().map(|input| what.of(&input.level_set, plan.as_ref(), &context.run));
+    let what = What { color: &color, plan, from, stripes, patches, other: other.first().map(|input| &input.level_set) };
+    let subjects = inputs.iter().map(|input| Subject::new(&what, &input.level_set, &context.run));
     let subjects: Vec<Subject> = subjects.collect::<Result<_>>()?;
     let mut options = options.clone();
     if subjects.len() > 1 {
@@ -239,67 +243,56 @@ impl Color {
 /// What the colours say, of any input.
 struct What<'a> {
     color: &'a Color,
+    plan: Option<RegionPlan>,
     from: Vec<DVec3>,
     stripes: Option<f64>,
+    patches: Option<Patches>,
     other: Option<&'a LevelSet>,
 }
 
 /// An input with what its colours say.
 struct Subject<'a> {
+    what: &'a What<'a>,
     level_set: &'a LevelSet,
-    color: &'a Color,
-    stripes: Option<f64>,
-    other: Option<&'a LevelSet>,
     region: Option<Box<dyn Region>>,
     components: Option<Components>,
     distances: Option<Field>,
-    patches: Option<Patches>,
 }
 
-impl<'a> What<'a> {
-    fn of(&self, level_set: &'a LevelSet, plan: Option<&RegionPlan>, run: &RunOptions) -> Result<Subject<'a>> {
-        Ok(Subject {
+impl<'a> Subject<'a> {
+    fn new(what: &'a What, level_set: &'a LevelSet, run: &RunOptions) -> Result<Self> {
+        let of_points = || level_set.geodesic(&what.from, run).map(|geodesic| geodesic.reached());
+        Ok(Self {
+            what,
             level_set,
-            color: self.color,
-            stripes: self.stripes,
-            other: self.other,
-            region: plan.map(|plan| plan.on(level_set, run)).transpose()?,
-            components: (*self.color == Color::Component).then(|| level_set.components(run)).transpose()?,
-            distances: match self.color {
-                Color::Geodesic => Some(level_set.geodesic(&self.from, run)?.reached()),
-                _ => None,
-            },
-            patches: match self.color {
-                Color::Patch(path) | Color::Distortion(path) => Some(Patches::read(path)?),
-                _ => None,
-            },
+            region: what.plan.as_ref().map(|plan| plan.on(level_set, run)).transpose()?,
+            components: (*what.color == Color::Component).then(|| level_set.components(run)).transpose()?,
+            distances: (*what.color == Color::Geodesic).then(of_points).transpose()?,
         })
     }
-}
 
-impl Subject<'_> {
     fn draw(&self, options: &RenderOptions, run: &RunOptions) -> Result<Image> {
+        let What { stripes, ref patches, other, .. } = *self.what;
         let label = |xyz: DVec3| self.components.as_ref()?.nearest(self.level_set.transform().world_to_index(xyz));
         let stripe = |xyz: DVec3| {
-            let (field, width) = (self.distances.as_ref()?, self.stripes?);
+            let (field, width) = (self.distances.as_ref()?, stripes?);
             let distance = Field::trilinear(&mut field.accessor(), field.transform().world_to_index(xyz))?;
             Some((f64::from(distance) / width) as u32 % 2)
         };
-        let color_by = match (self.color, self.other, &self.region, &self.distances) {
-            (Color::Component, ..) => ColorBy::Label(&label),
-            (Color::Geodesic, ..) if self.stripes.is_some() => ColorBy::Label(&stripe),
-            (Color::Geodesic, .., Some(field)) => ColorBy::Geodesic(field),
-            (Color::Difference(_), Some(other), ..) => ColorBy::Difference(other),
-            (Color::Region, _, Some(region), _) => ColorBy::Region(&**region),
-            (Color::Curvature, ..) => ColorBy::Curvature,
-            (Color::Normal, ..) => ColorBy::Normal,
-            _ => match (self.color, &self.patches) {
-                (Color::Patch(_), Some(patches)) => ColorBy::Patches(patches),
-                (Color::Distortion(_), Some(patches)) => ColorBy::Distortion(patches),
-                _ => ColorBy::Clay,
-            },
+        // What a colour needs was made with it.
+        let color_by = match self.what.color {
+            Color::Clay => None,
+            Color::Curvature => Some(ColorBy::Curvature),
+            Color::Normal => Some(ColorBy::Normal),
+            Color::Component => Some(ColorBy::Label(&label)),
+            Color::Geodesic if stripes.is_some() => Some(ColorBy::Label(&stripe)),
+            Color::Geodesic => self.distances.as_ref().map(ColorBy::Geodesic),
+            Color::Difference(_) => other.map(ColorBy::Difference),
+            Color::Region => self.region.as_deref().map(|region| ColorBy::Region(region)),
+            Color::Patch(_) => patches.as_ref().map(ColorBy::Patches),
+            Color::Distortion(_) => patches.as_ref().map(ColorBy::Distortion),
         };
-        render(self.level_set, &color_by, options, run)
+        render(self.level_set, &color_by.unwrap_or(ColorBy::Clay), options, run)
     }
 }
 

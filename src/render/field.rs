@@ -126,7 +126,7 @@ impl Cursor<'_> {
         self.enter(base);
         let part = ijk - floor;
         let [wx, wy, wz] = [part.x, part.y, part.z].map(|t| spline_weights(t as f32));
-        let taps = self.block(base - self.origin - 1);
+        let taps = self.taps(base - self.origin - 1);
         // Sums over x, then y, then z; the indices are the orders of the derivatives along those axes.
         let over_x = |d: usize| {
             let mut plane = [0.0f32; 16];
@@ -157,7 +157,7 @@ impl Cursor<'_> {
 
     /// The 4³ voxels from `first`, relative to the current leaf and at most a leaf away; z runs fastest.
     #[inline(always)]
-    fn block(&self, first: IVec3) -> [f32; 64] {
+    fn taps(&self, first: IVec3) -> [f32; 64] {
         let mut taps = [0.0; 64];
         let mut leaf = (usize::MAX, self.field.grid.values(self.id));
         for (row, taps) in (0..).zip(taps.chunks_exact_mut(4)) {

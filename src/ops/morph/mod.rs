@@ -35,7 +35,7 @@ use crate::run::RunOptions;
 use distance::TargetDistance;
 use leg::{Law, Leg};
 use pose::{Moments, Pose};
-pub use sequence::{FrameFacts, Place, Sequence, SequenceReport, TakeFrame, Ways, other_units};
+pub use sequence::{FrameFacts, Place, Sequence, SequenceReport, TakeFrame, Ways};
 
 const NAME: &str = "morph";
 
@@ -174,7 +174,7 @@ impl Operator for Morph {
             let warnings = vec!["all shapes are empty: so is the result".into()];
             return Ok(Outcome { level_set: first.clone(), summary: Summary { warnings, ..Summary::default() } });
         }
-        let plan = Sequence::new(&inputs, self, run)?;
+        let plan = Sequence::new(&inputs, self, run, &mut |_| ())?;
         let place = plan.locate(self.at);
         let mut made = None;
         let report = plan.frames(&[place], &mut |_, level_set, facts| {

@@ -128,8 +128,14 @@ struct Prepared {
 }
 
 impl<'a> Sequence<'a> {
-    /// Plans a sequence through two or more shapes. What will not take part is among the [`warnings`](Self::warnings).
-    pub fn new(inputs: &[LevelSet], params: &'a Morph, run: &'a RunOptions) -> Result<Self> {
+    /// Plans a sequence through two or more shapes. What will not take part is among the [`warnings`](Self::warnings); `tell` gets each of these as soon as it is
+    /// known: what shapes in other units ask for may take long.
+    pub fn new(
+        inputs: &[LevelSet],
+        params: &'a Morph,
+        run: &'a RunOptions,
+        tell: &mut dyn FnMut(&str),
+    ) -> Result<Self> {
         params.validate()?;
         let mut warnings = Vec::new();
         if let Some(n) = inputs.iter().position(LevelSet::is_empty) {
@@ -148,11 +154,14 @@ impl<'a> Sequence<'a> {
             return Err(EditError::parameter(NAME, "frame_count", params.frame_count, accepted));
         }
         warnings.extend(other_units(inputs, run)?);
+        warnings.iter().for_each(|warning| tell(warning));
+        let told = warnings.len();
         let shapes = on_one_lattice(inputs, &mut warnings, run)?;
         let mut prepared = Vec::new();
         for n in 0..legs {
             prepared.push(prepare(&shapes[n], &shapes[n + 1], n, params, &mut warnings, run)?);
         }
+        warnings.iter().skip(told).for_each(|warning| tell(warning));
         Ok(Self { params, run, shapes, legs: prepared, warnings })
     }
 
@@ -288,9 +297,8 @@ impl<'a> Sequence<'a> {
     }
 }
 
-/// What is to be said of shapes whose sizes differ so much that one of them may be in other units. To be known before they are put on one lattice, which may
-/// take long then.
-pub fn other_units(inputs: &[LevelSet], run: &RunOptions) -> Result<Vec<String>> {
+/// What is to be said of shapes whose sizes differ so much that one of them may be in other units.
+fn other_units(inputs: &[LevelSet], run: &RunOptions) -> Result<Vec<String>> {
     let sizes: Vec<f64> = inputs.iter().map(|shape| Ok(shape.measure(run)?.volume.cbrt())).collect::<Result<_>>()?;
     let differ = |(n, pair): (usize, &[f64])| {
         let ratio = (pair[0] / pair[1]).max(pair[1] / pair[0]);

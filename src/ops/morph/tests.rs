@@ -40,7 +40,7 @@ fn components(level_set: &LevelSet) -> u64 {
 
 fn frames(inputs: &[LevelSet], params: &Morph) -> (Vec<(LevelSet, FrameFacts)>, SequenceReport) {
     let run = RunOptions::default();
-    let sequence = Sequence::new(inputs, params, &run).unwrap();
+    let sequence = Sequence::new(inputs, params, &run, &mut |_| ()).unwrap();
     let places = sequence.places();
     let mut made = Vec::new();
     let report = sequence
@@ -56,7 +56,7 @@ fn frames(inputs: &[LevelSet], params: &Morph) -> (Vec<(LevelSet, FrameFacts)>, 
 }
 
 fn refused(inputs: &[LevelSet], params: &Morph) -> String {
-    Sequence::new(inputs, params, &RunOptions::default()).err().unwrap().to_string()
+    Sequence::new(inputs, params, &RunOptions::default(), &mut |_| ()).err().unwrap().to_string()
 }
 
 /// The distance to a target wherever a surface goes on its way there.
@@ -262,7 +262,7 @@ fn a_bridge_lets_a_part_that_is_not_overlapped_arrive() {
     let target = csg(&left, &[&right], CsgOperation::Union, &run).unwrap();
     let source = ball(DVec3::new(-10.0, 0.0, 0.0), 4.0);
     let shapes = [source, target.clone()];
-    let sequence = Sequence::new(&shapes, &Morph::default(), &run).unwrap().warnings().join("; ");
+    let sequence = Sequence::new(&shapes, &Morph::default(), &run, &mut |_| ()).unwrap().warnings().join("; ");
     assert!(sequence.contains("1 of 2 parts of shape 2") && sequence.contains("not appear"), "{sequence}");
     // Without a bridge half of it is reached.
     let reached = at_rest(&shapes[0], &target, 80);
@@ -381,7 +381,7 @@ fn refusals_and_warnings() {
     let (small, large) = (ball(DVec3::ZERO, 2.0), ball(DVec3::ZERO, 45.0));
     let run = RunOptions::default();
     let params = Morph::default();
-    let sequence = Sequence::new(&[small, large], &params, &run).unwrap();
+    let sequence = Sequence::new(&[small, large], &params, &run, &mut |_| ()).unwrap();
     assert!(sequence.warnings()[0].contains("same units"), "{:?}", sequence.warnings());
     // In a recipe it is a frame.
     let half = Morph { at: 0.5, ..Morph::default() }.apply(shapes.to_vec(), &run).unwrap();

@@ -10,11 +10,11 @@ use smallvec::SmallVec;
 use super::super::Tracker;
 use super::super::curvature_flow::upwind_gradient;
 use super::super::evolve::{Motion, Report};
-use super::pull::{Distance, Found, Pull};
+use super::pull::{Approach, Found, Pull};
 use super::{AttractionReport, IndexBounds, OPERATION, REACHED, leaves_around};
 use crate::error::Result;
 use crate::grid::{
-    Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafValues, leaf_offset, leaf_origin, offset_to_local,
+    Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafSet, LeafValues, leaf_offset, leaf_origin, offset_to_local,
 };
 use crate::levelset::{LevelSet, Sampler};
 use crate::stencil::FaceHalo;
@@ -67,7 +67,6 @@ type Speeds = FxHashMap<usize, Box<LeafValues>>;
 const GROWTH: f64 = 4.0;
 
 /// What is drawn: the first and the last voxel of it in each leaf, by the leaf's origin.
-#[derive(Default)]
 struct Drawn(FxHashMap<IVec3, (IVec3, IVec3)>);
 
 impl Drawn {
@@ -108,7 +107,7 @@ struct LeafFelt {
     nearest: Option<f64>,
     /// The targets that are next to the surface.
     touched: Vec<Touched>,
-    distances: Vec<Distance>,
+    approaches: Vec<Approach>,
 }
 
 /// A target next to the surface, and the way to it.
@@ -237,7 +236,7 @@ impl<'a> Drawing<'a> {
                 continue;
             };
             near = Some(voxel.target);
-            felt.distances.push(voxel.place());
+            felt.approaches.push(voxel.approach());
             // What is about to be drawn limits the step as well.
             felt.travel = felt.travel.max(voxel.travel * alpha);
             let speed = voxel.speed * alpha;
@@ -269,7 +268,7 @@ impl<'a> Drawing<'a> {
         let (start, felt, next) = (self.start.grid(), FELT as f32 * voxel_size, NEXT * voxel_size);
         let grid = &mut *tracker.grid;
         let origins: FxHashMap<usize, IVec3> = grid.leaves().iter().map(|id| (id.index(), grid.origin(*id))).collect();
-        let leaves = grid.leaves().iter().copied().filter(|id| self.around.contains(&origins[&id.index()])).collect();
+        let leaves = self.awake(grid);
         grid.update(&leaves, |id, values, _| {
             let Some(origin) = origins.get(&id.index()) else { return };
             let moved = self.moved.get(origin).copied().unwrap_or(LeafMask::EMPTY);
@@ -283,11 +282,9 @@ impl<'a> Drawing<'a> {
         });
     }
 
-    /// Lets the leaves move that are drawn and those around them, as far as the band of what moves reaches: the others are at rest.
-    fn confine(&self, tracker: &mut Tracker) {
-        let grid = tracker.grid();
-        let leaves = grid.leaves().iter().copied().filter(|id| self.around.contains(&grid.origin(*id))).collect();
-        tracker.confine(Some(leaves));
+    /// The leaves that are drawn and those around them, as far as the band of what moves reaches: the others are at rest.
+    fn awake(&self, grid: &Grid) -> LeafSet {
+        grid.leaves().iter().copied().filter(|id| self.around.contains(&grid.origin(*id))).collect()
     }
 
     /// F of the voxels of a leaf that lie farther from the surface.
@@ -323,7 +320,7 @@ impl<'a> Drawing<'a> {
         let mut felt = grid.map_leaves(|id| self.feel(grid, id));
         if self.drawn.is_none() {
             // What lies closest to the targets is known only now.
-            self.found.note(felt.iter().flat_map(|felt| &felt.distances));
+            self.found.note(felt.iter().flat_map(|felt| &felt.approaches));
             felt = grid.map_leaves(|id| self.feel(grid, id));
         }
         let most = |of: fn(&LeafFelt) -> f64| felt.iter().map(of).fold(0.0, f64::max);
@@ -339,7 +336,7 @@ impl<'a> Drawing<'a> {
             grid.leaves().iter().zip(speeds).filter_map(|(id, speeds)| Some((id.index(), speeds?))).collect()
         };
         self.touched.clear();
-        self.found.note(felt.iter().flat_map(|felt| &felt.distances));
+        self.found.note(felt.iter().flat_map(|felt| &felt.approaches));
         for touched in felt.iter().flat_map(|felt| &felt.touched) {
             let place = self.touched.entry(touched.point.round().as_ivec3().to_array());
             place.and_modify(|known| known.towards += touched.towards).or_insert(*touched);
@@ -393,7 +390,7 @@ impl Motion for Drawing<'_> {
     /// In as many parts as changes of the normal ask for: the band is tracked after all of them, since each renormalisation takes a little off tips.
     fn step(&mut self, tracker: &mut Tracker, dt: f64) -> Result<()> {
         self.anchor(tracker);
-        self.confine(tracker);
+        tracker.confine(Some(self.awake(tracker.grid())));
         let mut left = dt;
         loop {
             let part = left / (left / self.substep).ceil().max(1.0);

@@ -33,11 +33,13 @@ const FOOTING: f64 = 0.5;
 /// of as many voxels more. A single point six voxels off is reached with the least tip.
 const FAR_TIP: f64 = Attraction::TIP / 6.0;
 
-/// How far aside of the way from a target to the surface point closest to it, in voxels, all is drawn whose cosine lies above these, fully above the second. On the
-/// edge of a solid and on a sharp bump hardly a voxel is within the limits of the flow, and what grows from a single one breaks off.
+/// How far aside of the way from a target to the surface point closest to it all is drawn that faces it: at least so many voxels, and such a part of the distance,
+/// two thirds of what the limits draw of a plane. On the edge of a solid and on a sharp bump hardly a voxel is within the limits, and what grows from a single
+/// one breaks off.
 const FRONT: f64 = 2.5;
-/// The same for far targets, as a part of their distance: two thirds of what the limits draw of a plane.
 const FRONT_SLOPE: f64 = 0.4;
+
+/// The cosines between which what is drawn there rises from nothing to all.
 const FORWARD: [f64; 2] = [0.0, 0.5];
 
 /// Voxels around what is drawn and what draws it that may change as well.
@@ -80,14 +82,19 @@ pub(super) struct Found {
     pub aims: FxHashMap<IVec3, DVec3>,
 }
 
-/// The voxel of a target, the distance of a surface point from it, and that point.
-pub(super) type Distance = (IVec3, f64, DVec3);
+/// How near a surface point is to a target.
+pub(super) struct Approach {
+    /// The target's voxel.
+    target: IVec3,
+    distance: f64,
+    foot: DVec3,
+}
 
 impl Found {
     /// Notes the closest of surface points anew.
-    pub fn note<'d>(&mut self, distances: impl Iterator<Item = &'d Distance>) {
+    pub fn note<'d>(&mut self, approaches: impl Iterator<Item = &'d Approach>) {
         self.closest.clear();
-        for (target, distance, foot) in distances {
+        for Approach { target, distance, foot } in approaches {
             let known = self.closest.entry(*target).or_insert((*distance, *foot));
             let order = distance.total_cmp(&known.0);
             // Of points that are equally close, the same one in any order.
@@ -104,8 +111,8 @@ fn lexical(a: DVec3, b: DVec3) -> Ordering {
 
 impl Felt {
     /// What there is to note of it.
-    pub fn place(&self) -> Distance {
-        (self.target.point.round().as_ivec3(), self.distance, self.foot)
+    pub fn approach(&self) -> Approach {
+        Approach { target: self.target.point.round().as_ivec3(), distance: self.distance, foot: self.foot }
     }
 }
 
@@ -193,7 +200,7 @@ impl<'a> Pull<'a> {
             let Some(felt) = self.at(sampler, None, voxel_size, ijk, drawn.near, &nothing_found) else { return };
             drawn.near = Some(felt.target);
             if self.how.repel || felt.gap >= REACHED {
-                drawn.distances.push(felt.place());
+                drawn.approaches.push(felt.approach());
                 if felt.share > 0.0 {
                     drawn.bounds = joined(drawn.bounds, (ijk.as_dvec3(), felt.target.point));
                 }
@@ -205,7 +212,7 @@ impl<'a> Pull<'a> {
             .fold(None, |all, (a, b)| joined(joined(all, (a, a)), (b, b)));
         if self.draws_in_front() {
             let mut found = Found::default();
-            found.note(leaves.iter().flat_map(|drawn| &drawn.distances));
+            found.note(leaves.iter().flat_map(|drawn| &drawn.approaches));
             bounds = found.closest.iter().fold(bounds, |all, (target, (distance, foot))| {
                 let aside = DVec3::splat(SQRT_2 * front_radius(*distance));
                 joined(joined(all, (target.as_dvec3(), *foot)), (foot - aside, foot + aside))
@@ -343,7 +350,7 @@ fn joined(bounds: Option<IndexBounds>, (a, b): (DVec3, DVec3)) -> Option<IndexBo
 #[derive(Default)]
 struct LeafDrawn {
     bounds: Option<IndexBounds>,
-    distances: Vec<Distance>,
+    approaches: Vec<Approach>,
     /// The target of the voxel before.
     near: Option<Target>,
 }
