@@ -51,7 +51,7 @@ fn morph(from: &str, to: &str, resolution: f64) -> Result<()> {
     let shapes = [mesh_to_level_set(a, &params, &run)?.0, mesh_to_level_set(b, &params, &run)?.0];
     let converted = began.elapsed();
     let morph = Morph::default();
-    let sequence = Sequence::new(&shapes, &morph, &run)?;
+    let sequence = Sequence::new(&shapes, &morph, &run, &mut |_| ())?;
     let planned = began.elapsed();
     let places = sequence.places();
     let report = sequence.frames(&places, &mut |n, level_set, _| {

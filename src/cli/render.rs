@@ -288,7 +288,7 @@ impl<'a> Subject<'a> {
             Color::Geodesic if stripes.is_some() => Some(ColorBy::Label(&stripe)),
             Color::Geodesic => self.distances.as_ref().map(ColorBy::Geodesic),
             Color::Difference(_) => other.map(ColorBy::Difference),
-            Color::Region => self.region.as_deref().map(|region| ColorBy::Region(region)),
+            Color::Region => self.region.as_deref().map(ColorBy::Region),
             Color::Patch(_) => patches.as_ref().map(ColorBy::Patches),
             Color::Distortion(_) => patches.as_ref().map(ColorBy::Distortion),
         };
