@@ -19,7 +19,7 @@ mod shell;
 mod simplify;
 mod spline;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod to_levelset;
 mod topology;
 mod unit;

@@ -304,3 +304,110 @@ fn thin_shells_holes_and_colours() {
     }
     assert!(side[0].min(side[1]) == 0.0 && side[0].max(side[1]) > 100.0, "{side:?}");
 }
+
+/// MATH.md 7.2: moved along its normal, a plane of any slope loses energy at the rate ψ'(D) = w(D) D an area, without a
+/// cosine: the one of the range's change and the one of the pixels an area cancel.
+#[test]
+fn the_force_is_that_of_the_energy_at_any_slope() {
+    let run = RunOptions::default();
+    for slope in [0.0, 1.0, 3.0] {
+        // The upper face of a block lies in z = slope x; measured was the plane one voxel above it.
+        let turn = DMat3::from_rotation_y(-f64::atan(slope));
+        let mut block = crate::mesh::testing::cube(DVec3::splat(-1.0), 2.0);
+        block.positions.iter_mut().for_each(|p| *p = turn * (*p * DVec3::new(30.0, 30.0, 10.0) - DVec3::Z * 10.0));
+        let transform = Transform::uniform(1.0);
+        let mut surface = level_set_of_mesh(block, &transform, 3.0, &run).unwrap();
+        const PIXELS: usize = 200;
+        const FAR: f64 = 200.0;
+        let (half, pitch) = (25.0, 50.0 / (PIXELS as f64 - 1.0));
+        let ranges = |_v| (0..PIXELS).map(|u| (FAR - 1.0 - slope * (u as f64 * pitch - half)) as f32);
+        let map = RangeMap::new(
+            "plane".into(),
+            Projection::Orthographic { first: DVec2::splat(-half), pitch: DVec2::splat(pitch) },
+            DAffine3::from_translation(DVec3::Z * FAR),
+            PIXELS,
+            (0..PIXELS).flat_map(ranges).collect(),
+        );
+        // ψ of the surface moved by `t` along its normal, over the pixels of an area.
+        let width = 2.0;
+        let energy = |t: f64| {
+            let distance: f64 = -1.0 + t * slope.hypot(1.0);
+            width * width * (1.0 - (-0.5 * (distance / width).powi(2)).exp()) / slope.hypot(1.0)
+        };
+        let rate = (energy(-1e-4) - energy(1e-4)) / 2e-4;
+        let terms = [Term::new(&map, width, 1.0, None, f64::INFINITY)];
+        let forces = Forces::new(&terms, transform, &run);
+        let step = 0.25;
+        let mut control = |moment: &Moment| (moment.steps == 0).then_some(step);
+        move_surface(&mut surface, &forces, 0.0, 0.0, 1, &mut control, &run).unwrap();
+        let moved = -f64::from(surface.grid().accessor().value(glam::IVec3::ZERO));
+        println!("slope {slope}: moved {moved:.4}, energy falls by {:.4}", step * rate);
+        assert!((moved / (step * rate) - 1.0).abs() < 0.02, "{slope}: {moved} {}", step * rate);
+    }
+}
+
+/// MATH.md 7.4: maps that face away from a surface, and measured what lies behind it, push it outwards (by 0.17 voxel there); the
+/// gate takes that away.
+#[test]
+fn the_gate_takes_away_what_maps_of_the_other_side_push() {
+    let mut set = six_maps(torus, 0.2 * MINOR, false);
+    let width = 0.4 * MINOR;
+    for map in &mut set.maps {
+        let projection = map.projection;
+        map.low_pass(|range| 0.5 / projection.pixel_size(range), 3.0 * width);
+        map.distrust_edges(3.0 * width);
+    }
+    let terms: Vec<Term> = set.maps.iter().map(|map| Term::new(map, width, 1.0, None, f64::INFINITY)).collect();
+    let (mut points, mut normals) = (Vec::new(), Vec::new());
+    for i in 0..200 {
+        for j in 0..90 {
+            let (u, v) = (f64::from(i) * std::f64::consts::TAU / 200.0, f64::from(j) * std::f64::consts::TAU / 90.0);
+            let n = DVec3::new(u.cos() * v.cos(), u.sin() * v.cos(), v.sin());
+            points.push(DVec3::new(u.cos(), u.sin(), 0.0) * MAJOR + n * MINOR);
+            normals.push(n);
+        }
+    }
+    let views: Vec<_> = terms.iter().map(|term| term.views(&points, &normals)).collect();
+    // Where the force would be at rest, to first order, in the mean over points.
+    let shift = |gate: &dyn Fn(f64) -> f64| {
+        let at = |i: usize| {
+            let (mut push, mut weights) = (0.0, 0.0);
+            for view in views.iter().map(|views| views[i]).filter(|view| view.weight > 0.0) {
+                let weight = f64::from(view.weight) * gate(view.cosine.into());
+                push -= weight * f64::from(view.distance);
+                weights += weight;
+            }
+            (weights > 0.05).then(|| push / weights)
+        };
+        let shifts: Vec<f64> = (0..points.len()).filter_map(at).collect();
+        shifts.iter().sum::<f64>() / shifts.len() as f64
+    };
+    let (off, step, ramp) =
+        (shift(&|_| 1.0), shift(&|c| f64::from(u8::from(c > 0.0))), shift(&|c| (c / 0.2).clamp(0.0, 1.0)));
+    println!("gate off {off:+.3} step {step:+.3} ramp {ramp:+.3}");
+    // What grazes the surface pushes outwards as well, by 0.10 there without a prior; the ramp takes some of it.
+    assert!(off - step > 0.17 && step < 0.2 && ramp.abs() < 0.7 * step, "{off} {step} {ramp}");
+    // The first surface, by the same maps.
+    let run = RunOptions::default();
+    let bounds = (glam::IVec3::splat(-42), glam::IVec3::splat(42));
+    let first = Forces::new(&terms, Transform::uniform(1.0), &run).first_surface(3.0, bounds, &run).unwrap();
+    let (rms, mean) = error(&first, torus);
+    println!("first surface: rms {rms:.3} mean {mean:+.3}");
+    assert!(rms < 0.35, "{rms}");
+}
+
+/// MATH.md 7.4: the prior shifts the surface inwards, the more the larger β is.
+#[test]
+fn the_prior_shifts_the_surface_inwards() {
+    let set = six_maps(torus, 0.2 * MINOR, false);
+    let means = [0.0, 0.5, 2.0, 5.0].map(|beta| {
+        let (level_set, _) = made(set.clone(), &Reconstruct { beta, ..voxels() });
+        let (rms, mean) = error(&level_set, torus);
+        println!("beta {beta}: rms {rms:.3} mean {mean:+.3}");
+        assert!(rms < 0.28, "{beta}: {rms}");
+        mean
+    });
+    assert!(means.is_sorted_by(|a, b| a > b), "{means:?}");
+    // From +0.10 to −0.13 there.
+    assert!((0.15..0.35).contains(&(means[0] - means[3])), "{means:?}");
+}
