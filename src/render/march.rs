@@ -92,6 +92,9 @@ impl Scene<'_> {
         while t < t_end {
             let mut cell = floor(ray.at(t));
             let block = self.skip.block(cell);
+            if let Some(visited) = &mut cursor.visited {
+                visited.insert(self.skip.number(block));
+            }
             if let Some(empty) = self.skip.empty_around(block) {
                 let beyond = ray.crossing(empty).1 + NUDGE;
                 // Rounding may leave a grazing ray in the same block: growing steps get it out.
@@ -276,7 +279,7 @@ mod tests {
         let r = 25.0;
         let set = sphere(r, 3.0);
         let scene = scene(&set);
-        let mut cursor = scene.field.cursor();
+        let mut cursor = scene.field.cursor(None);
         let (mut hits, mut misses) = (0, 0);
         for i in 0..3000 {
             // Rays from all around, aimed at points spread over a cube around the sphere.
@@ -308,7 +311,7 @@ mod tests {
     fn rays_along_the_axes_and_from_the_surface() {
         let set = sphere(25.0, 3.0);
         let scene = scene(&set);
-        let mut cursor = scene.field.cursor();
+        let mut cursor = scene.field.cursor(None);
         for axis in [DVec3::X, DVec3::Y, DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y, DVec3::NEG_Z] {
             let from_outside = Ray::new(axis * -100.0, axis);
             let hit = scene.hit(&mut cursor, &from_outside, Start::Outside, f64::INFINITY).unwrap();

@@ -143,7 +143,7 @@ mod tests {
     fn a_convex_surface_sees_the_whole_sky() {
         let set = sphere(20.0, 3.0);
         let scene = scene(&set);
-        let mut cursor = scene.field.cursor();
+        let mut cursor = scene.field.cursor(None);
         let light = Light { key: DVec3::Y, range: 30.0, sky_rays: 8, key_rays: 4 };
         for i in 0..64 {
             let a = f64::from(i) * 2.399963;

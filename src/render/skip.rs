@@ -87,12 +87,8 @@ impl SkipMap {
     /// The boxes of the blocks that may hold surface, in index space.
     pub fn blocks(&self) -> impl Iterator<Item = (DVec3, DVec3)> + '_ {
         let edge = f64::from(1u32 << self.shift);
-        let row = self.size.z;
-        self.distance.iter().enumerate().filter(|(_, distance)| **distance == 0).map(move |(n, _)| {
-            let n = n as i32;
-            let lo = (self.lo + IVec3::new(n / (self.size.y * row), n / row % self.size.y, n % row)).as_dvec3() * edge;
-            (lo, lo + edge)
-        })
+        let with_surface = self.entries().filter(|(_, distance)| *distance == 0);
+        with_surface.map(move |(first, _)| (first.as_dvec3(), first.as_dvec3() + edge))
     }
 
     /// The block of a cell.
@@ -104,13 +100,37 @@ impl SkipMap {
     /// The box around a block that holds no surface, in index space: `None` if the block itself may hold some.
     #[inline(always)]
     pub fn empty_around(&self, block: IVec3) -> Option<(DVec3, DVec3)> {
-        let local = (block - self.lo).clamp(IVec3::ZERO, self.size - 1);
-        let distance = i32::from(self.distance[self.index(local)]);
+        let distance = i32::from(self.distance[self.number(block)]);
         if distance == 0 {
             return None;
         }
         let edge = f64::from(1u32 << self.shift);
         Some(((block - (distance - 1)).as_dvec3() * edge, (block + distance).as_dvec3() * edge))
+    }
+
+    /// The place of a block, or of the nearest one of the map.
+    #[inline(always)]
+    pub fn number(&self, block: IVec3) -> usize {
+        self.index((block - self.lo).clamp(IVec3::ZERO, self.size - 1))
+    }
+
+    /// How many blocks there are.
+    pub fn count(&self) -> usize {
+        self.distance.len()
+    }
+
+    /// Whether both maps have the same blocks.
+    pub fn is_congruent(&self, other: &Self) -> bool {
+        (self.lo, self.size, self.shift) == (other.lo, other.size, other.shift)
+    }
+
+    /// The first voxel of each block, by its place, and its distance to the surface.
+    pub fn entries(&self) -> impl ExactSizeIterator<Item = (IVec3, u8)> + '_ {
+        let (row, plane) = (self.size.z, self.size.y * self.size.z);
+        self.distance.iter().enumerate().map(move |(n, distance)| {
+            let n = n as i32;
+            ((self.lo + IVec3::new(n / plane, n / row % self.size.y, n % row)) << self.shift, *distance)
+        })
     }
 
     /// Bytes of the map.

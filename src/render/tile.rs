@@ -9,10 +9,12 @@ use super::camera::Camera;
 use super::field::Cursor;
 use super::march::{Ray, Scene, Start};
 use super::occlusion::{self, FilterPoint, Light, REACH, Visibility, filter_weight};
+use super::png::Image;
+use super::redraw::Blocks;
 use super::screen::Screen;
 use super::shade::{self, Lights};
 use super::vertices::sequential;
-use super::{ColorBy, DataRange};
+use super::{ColorBy, DataRange, legend};
 use crate::grid::{Accessor, Transform};
 use crate::levelset::Sampler;
 
@@ -106,17 +108,51 @@ impl Window {
 }
 
 impl Picture<'_> {
-    /// RGBA of the tile whose first pixel is (x0, y0), row by row, cut at the picture's border.
-    pub fn tile(&self, x0: u32, y0: u32) -> Vec<u8> {
+    /// The first pixels of all tiles.
+    pub fn corners(&self) -> Vec<(u32, u32)> {
+        let columns = |y| (0..self.width).step_by(TILE as usize).map(move |x| (x, y));
+        (0..self.height).step_by(TILE as usize).flat_map(columns).collect()
+    }
+
+    /// Pixels around a tile that it looks at: one for the search for edges, the filter's reach around that.
+    fn rim(&self) -> i64 {
+        REACH * self.spacing + 1
+    }
+
+    /// The pixels that a tile looks at: the first of them, and the first beyond.
+    pub fn window(&self, (x, y): (u32, u32)) -> ([i64; 2], [i64; 2]) {
+        let corner = [i64::from(x), i64::from(y)];
+        (corner.map(|at| at - self.rim()), corner.map(|at| at + i64::from(TILE) + self.rim()))
+    }
+
+    /// The picture of all tiles.
+    pub fn assembled<'t>(&self, tiles: impl Iterator<Item = &'t Vec<u8>>) -> Image {
+        let (width, height) = (self.width, self.height);
+        let mut rgba8 = vec![0; width as usize * height as usize * 4];
+        for ((x, y), tile) in self.corners().into_iter().zip(tiles) {
+            let row_bytes = TILE.min(width - x) as usize * 4;
+            for (row, bytes) in (y as usize..).zip(tile.chunks_exact(row_bytes)) {
+                let at = (row * width as usize + x as usize) * 4;
+                rgba8[at..at + row_bytes].copy_from_slice(bytes);
+            }
+        }
+        let mut image = Image { width, height, rgba8 };
+        if matches!(self.color_by, ColorBy::Distortion(_)) {
+            legend::draw(&mut image, 1.0, 1.0 + self.range.0);
+        }
+        image
+    }
+
+    /// RGBA of the tile whose first pixel is (x0, y0), row by row, cut at the picture's border. The blocks that its rays come through are
+    /// added to `visited`.
+    pub fn tile(&self, (x0, y0): (u32, u32), visited: Option<&mut Blocks>) -> Vec<u8> {
         let (width, height) = (TILE.min(self.width - x0), TILE.min(self.height - y0));
         let Some(scene) = &self.scene else {
             return (y0..y0 + height)
                 .flat_map(|y| (x0..x0 + width).flat_map(move |x| self.encode(x, y, DVec4::ZERO)))
                 .collect();
         };
-        // One pixel for the search for edges, the filter's reach around that.
-        let (reach, spacing) = (REACH * self.spacing, self.spacing);
-        let rim = reach + 1;
+        let (reach, spacing, rim) = (REACH * self.spacing, self.spacing, self.rim());
         let window = Window {
             x: i64::from(x0) - rim,
             y: i64::from(y0) - rim,
@@ -126,7 +162,7 @@ impl Picture<'_> {
         };
         let lit = |x: i64, y: i64| x.rem_euclid(spacing) == 0 && y.rem_euclid(spacing) == 0;
         let mut readers = Readers {
-            cursor: scene.field.cursor(),
+            cursor: scene.field.cursor(visited),
             other: match self.color_by {
                 ColorBy::Difference(other) => Some((other.sampler(), other.transform(), other.voxel_size())),
                 _ => None,
