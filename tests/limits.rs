@@ -31,7 +31,8 @@ fn holds_its_limit(words: &[&str], folder: &Path) {
     for part in [0.3, 0.6, 0.8, 0.95, 1.5] {
         clear();
         let limit = (free as f64 * part) as u64;
-        let limited = [words, &["--memory-limit", &limit.to_string()]].concat();
+        let bytes = limit.to_string();
+        let limited = [words, &["--memory-limit", &bytes]].concat();
         let ended = vdb_edit(&limited, folder, LIMIT);
         let peak = ended.peak_bytes;
         println!(

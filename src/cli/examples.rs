@@ -115,12 +115,12 @@ const EXAMPLES: &[Example] = &[
     },
     Example {
         operator: "sharpen",
-        shows: "The model, and 4 and 10 iterations.",
+        shows: "A scan, and 5 and 12 iterations.",
         commands: &[
-            "vdb-edit convert assets/spot.obj -o spot.vdb --resolution 160",
-            "vdb-edit sharpen spot.vdb -o little.vdb --iterations 4 --curvature-high 0.15,0.25",
-            "vdb-edit sharpen spot.vdb -o much.vdb --iterations 10 --curvature-high 0.15,0.25",
-            "vdb-edit render spot.vdb little.vdb much.vdb -o sharpen.png --columns 3 --size 260x220 --camera 200,15",
+            "vdb-edit convert assets/nefertiti_70k.ply -o bust.vdb --resolution 200",
+            "vdb-edit sharpen bust.vdb -o little.vdb --iterations 5",
+            "vdb-edit sharpen bust.vdb -o much.vdb --iterations 12",
+            "vdb-edit render bust.vdb little.vdb much.vdb -o sharpen.png --columns 3 --size 230x210 --camera 20,5",
         ],
     },
     Example {

@@ -258,11 +258,13 @@ fn text(recipe: &Path, done: &FrameReport, several: bool) -> String {
         let StepReport { op, name, seconds, kept, active_voxels, summary, .. } = step;
         let made = active_voxels.map(|n| format!("{} voxels", table::count(n)));
         let bytes = summary.details.get("bytes").and_then(Value::as_u64).map(size::shown);
+        let tile = |which: &str| summary.details.get("tiles")?.get(which)?.as_u64();
+        let tiles = || Some(format!("{} of {} tiles", tile("drawn")?, tile("all")?));
         vec![
             (*op).to_owned(),
             name.clone().unwrap_or_default(),
             if *kept { "kept".into() } else { format!("{seconds:.2} s") },
-            made.or(bytes).unwrap_or_default(),
+            made.or(bytes).or_else(tiles).unwrap_or_default(),
         ]
     });
     let mut text = format!(

@@ -9,6 +9,7 @@ use std::mem::{Discriminant, discriminant};
 
 use glam::IVec3;
 use rayon::prelude::*;
+use rustc_hash::FxHashSet;
 
 use super::camera::Camera;
 use super::png::Image;
@@ -105,7 +106,7 @@ impl Redraw {
             };
             coarse(&render(level_set, color_by, &small, run)?.enlarged(COARSE, options.width, options.height))?;
         }
-        let blocks = picture.scene.as_ref().map_or(0, |scene| scene.skip.count());
+        let blocks = picture.scene.as_ref().map_or(0, |scene| scene.skip.distances().len());
         let task = run.task(OPERATION, missing as u64);
         tiles.par_iter_mut().zip(&corners).filter(|(tile, _)| tile.is_none()).for_each(|(tile, corner)| {
             if !run.is_cancelled() {
@@ -170,12 +171,22 @@ impl Last {
     fn changed(&self, picture: &Picture<'_>, grid: &Grid) -> Blocks {
         let Some(scene) = &picture.scene else { return Blocks::none_of(0) };
         let (old, skip) = (self.level_set.grid(), &scene.skip);
-        let mut changed = Blocks::none_of(skip.count());
-        let sign = |grid: &Grid, first: IVec3| grid.voxel(first).0 < 0.0;
-        for (n, ((first, now), (_, before))) in skip.entries().zip(self.skip.entries()).enumerate() {
-            // Without surface a block has one sign.
-            if now != before || now > 0 && sign(grid, first) != sign(old, first) {
+        let mut changed = Blocks::none_of(skip.distances().len());
+        for (n, (now, before)) in skip.distances().iter().zip(self.skip.distances()).enumerate() {
+            if now != before {
                 changed.insert(n);
+            }
+        }
+        let mut insert = |ijk: IVec3| changed.insert(skip.number(skip.block(ijk)));
+        // Space without leaves of which the sign is another one.
+        let (tiles, tiles_before) = (grid.inside_tiles(), old.inside_tiles());
+        if tiles != tiles_before {
+            let (tiles, tiles_before) = (FxHashSet::from_iter(tiles), FxHashSet::from_iter(tiles_before));
+            for (lo, edge) in tiles.symmetric_difference(&tiles_before) {
+                let count = edge / LEAF_DIM;
+                for n in 0..count.pow(3) {
+                    insert(*lo + IVec3::new(n / (count * count), n / count % count, n % count) * LEAF_DIM);
+                }
             }
         }
         let gone = old.leaves().iter().map(|id| old.origin(*id)).filter(|origin| grid.find(*origin).is_sentinel());
@@ -183,7 +194,7 @@ impl Last {
         for origin in gone.chain(other.into_iter().flatten()) {
             for q in 0..27 {
                 let beside = origin + IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1) * LEAF_DIM;
-                changed.insert(skip.number(skip.block(beside)));
+                insert(beside);
             }
         }
         changed

@@ -87,8 +87,12 @@ impl SkipMap {
     /// The boxes of the blocks that may hold surface, in index space.
     pub fn blocks(&self) -> impl Iterator<Item = (DVec3, DVec3)> + '_ {
         let edge = f64::from(1u32 << self.shift);
-        let with_surface = self.entries().filter(|(_, distance)| *distance == 0);
-        with_surface.map(move |(first, _)| (first.as_dvec3(), first.as_dvec3() + edge))
+        let row = self.size.z;
+        self.distance.iter().enumerate().filter(|(_, distance)| **distance == 0).map(move |(n, _)| {
+            let n = n as i32;
+            let lo = (self.lo + IVec3::new(n / (self.size.y * row), n / row % self.size.y, n % row)).as_dvec3() * edge;
+            (lo, lo + edge)
+        })
     }
 
     /// The block of a cell.
@@ -114,23 +118,14 @@ impl SkipMap {
         self.index((block - self.lo).clamp(IVec3::ZERO, self.size - 1))
     }
 
-    /// How many blocks there are.
-    pub fn count(&self) -> usize {
-        self.distance.len()
-    }
-
     /// Whether both maps have the same blocks.
     pub fn is_congruent(&self, other: &Self) -> bool {
         (self.lo, self.size, self.shift) == (other.lo, other.size, other.shift)
     }
 
-    /// The first voxel of each block, by its place, and its distance to the surface.
-    pub fn entries(&self) -> impl ExactSizeIterator<Item = (IVec3, u8)> + '_ {
-        let (row, plane) = (self.size.z, self.size.y * self.size.z);
-        self.distance.iter().enumerate().map(move |(n, distance)| {
-            let n = n as i32;
-            ((self.lo + IVec3::new(n / plane, n / row % self.size.y, n % row)) << self.shift, *distance)
-        })
+    /// The distance of each block to the nearest one with surface, by their places.
+    pub fn distances(&self) -> &[u8] {
+        &self.distance
     }
 
     /// Bytes of the map.
