@@ -9,7 +9,6 @@ use std::mem::{Discriminant, discriminant};
 
 use glam::IVec3;
 use rayon::prelude::*;
-use rustc_hash::FxHashSet;
 
 use super::camera::Camera;
 use super::png::Image;
@@ -18,7 +17,7 @@ use super::skip::SkipMap;
 use super::tile::Picture;
 use super::{ColorBy, OPERATION, RenderOptions, prepare, render};
 use crate::error::Result;
-use crate::grid::{Grid, LEAF_DIM, LeafId};
+use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafId};
 use crate::levelset::LevelSet;
 use crate::run::RunOptions;
 
@@ -173,42 +172,35 @@ impl Last {
         let (old, skip) = (self.level_set.grid(), &scene.skip);
         let mut changed = Blocks::none_of(skip.distances().len());
         for (n, (now, before)) in skip.distances().iter().zip(self.skip.distances()).enumerate() {
-            if now != before {
+            // How far the surface is from a block without it only says in how many jumps a ray gets there: it enters a block with
+            // surface at its face, wherever it came from.
+            if (*now == 0) != (*before == 0) {
                 changed.insert(n);
             }
         }
-        let mut insert = |ijk: IVec3| changed.insert(skip.number(skip.block(ijk)));
-        // Space without leaves of which the sign is another one.
-        let (tiles, tiles_before) = (grid.inside_tiles(), old.inside_tiles());
-        if tiles != tiles_before {
-            let (tiles, tiles_before) = (FxHashSet::from_iter(tiles), FxHashSet::from_iter(tiles_before));
-            for (lo, edge) in tiles.symmetric_difference(&tiles_before) {
-                let count = edge / LEAF_DIM;
-                for n in 0..count.pow(3) {
-                    insert(*lo + IVec3::new(n / (count * count), n / count % count, n % count) * LEAF_DIM);
-                }
-            }
-        }
         let gone = old.leaves().iter().map(|id| old.origin(*id)).filter(|origin| grid.find(*origin).is_sentinel());
-        let other = grid.map_leaves(|id| differs(grid, old, id).then(|| grid.origin(id)));
+        let (neighbours, neighbours_before) = (grid.neighbours(), old.neighbours());
+        let differs = |id: LeafId| {
+            let before = old.find(grid.origin(id));
+            if before.is_sentinel() {
+                return true;
+            }
+            // Leaves that come or go beside it count for themselves.
+            let beside = neighbours[id.index()].iter().zip(&neighbours_before[before.index()]);
+            let turned = |(now, before): (&LeafId, &LeafId)| now.is_sentinel() && before.is_sentinel() && now != before;
+            let bits = |grid: &Grid, id: LeafId, at: usize| grid.values(id).0[at].to_bits();
+            let same = || (0..LEAF_VOXELS).all(|at| bits(grid, id, at) == bits(old, before, at));
+            beside.into_iter().any(turned) || !(before == id && grid.shares_storage(old, id)) && !same()
+        };
+        let other = grid.map_leaves(|id| differs(id).then(|| grid.origin(id)));
         for origin in gone.chain(other.into_iter().flatten()) {
             for q in 0..27 {
                 let beside = origin + IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1) * LEAF_DIM;
-                insert(beside);
+                changed.insert(skip.number(skip.block(beside)));
             }
         }
         changed
     }
-}
-
-/// Whether a leaf is new or holds other values than before.
-fn differs(grid: &Grid, old: &Grid, id: LeafId) -> bool {
-    let before = old.find(grid.origin(id));
-    if before.is_sentinel() {
-        return true;
-    }
-    let same = || grid.values(id).0.iter().zip(&old.values(before).0).all(|(a, b)| a.to_bits() == b.to_bits());
-    !(before == id && grid.shares_storage(old, id)) && !same()
 }
 
 #[cfg(test)]
