@@ -129,17 +129,18 @@ impl Drop for Disk<'_> {
 fn a_full_disk_leaves_the_old_file() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let Some(_disk) = Disk::mount(folder, "2m") else { return };
+    let Some(_disk) = Disk::mount(folder, "16m") else { return };
     assert_eq!(code(folder, &FIRST), Some(0));
     let before = fs::read(folder.join("out.vdb")).unwrap();
-    // Room for half of the file, and of a mesh and a picture that are as large.
-    fs::write(folder.join("ballast"), vec![0; (2 << 20) - before.len() * 3 / 2]).unwrap();
+    // Room for half as much as is there; each of these takes more.
+    fs::write(folder.join("ballast"), vec![0; (16 << 20) - before.len() * 3 / 2]).unwrap();
     let run = |words: &[&str]| {
         let output = Command::new(env!("CARGO_BIN_EXE_vdb-edit")).args(words).current_dir(folder).output().unwrap();
         (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
     };
+    let larger = ["shape", "sphere radius=2", "-o", "out.vdb", "--voxel-size", "0.02"];
     for words in [
-        &SECOND[..],
+        &larger[..],
         &["convert", "out.vdb", "-o", "out.ply"],
         &["render", "out.vdb", "-o", "out.png", "--size", "2000x2000"],
     ] {
@@ -150,7 +151,7 @@ fn a_full_disk_leaves_the_old_file() {
         assert_eq!(fs::read_dir(folder).unwrap().count(), 2, "{words:?}");
     }
     fs::remove_file(folder.join("ballast")).unwrap();
-    assert_eq!(code(folder, &SECOND), Some(0));
+    assert_eq!(code(folder, &larger), Some(0));
 }
 
 #[test]
