@@ -3,7 +3,7 @@
 //! Work is refused by estimate before it allocates ([`RunOptions::reserve`]). What no estimate foresaw is seen here: the run is cancelled as by a
 //! signal when the process holds more than the limit, and ended where it does not look.
 
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::error::EditError;
@@ -21,6 +21,9 @@ const TOLERANCE: u64 = 32;
 
 /// What the process held when it was too much; 0 before.
 static EXCEEDED: AtomicU64 = AtomicU64::new(0);
+
+/// Whether the run has ended, in whatever way.
+static ENDED: AtomicBool = AtomicBool::new(false);
 
 /// Bytes of the machine's memory that the process holds; 0 where the system does not tell.
 pub fn resident() -> u64 {
@@ -47,6 +50,9 @@ pub fn watch(run: &RunOptions, reporter: &Reporter) {
         while began.elapsed() < signal::GRACE && resident() <= limit + limit / TOLERANCE {
             std::thread::sleep(OFTEN);
         }
+        if ENDED.load(Ordering::Relaxed) {
+            return;
+        }
         let error = blamed(EditError::Cancelled { operation: "vdb-edit".into() }, Some(limit));
         reporter.error(&error, error.exit_code());
         signal::leave(error.exit_code());
@@ -55,8 +61,13 @@ pub fn watch(run: &RunOptions, reporter: &Reporter) {
     let _ = std::thread::Builder::new().name("memory".into()).spawn(work);
 }
 
-/// The error of a run that was cancelled since it took too much.
-pub fn blamed(error: EditError, limit: Option<u64>) -> EditError {
+/// The error of a run that has ended, cancelled perhaps since it took too much.
+pub fn ended(error: EditError, limit: Option<u64>) -> EditError {
+    ENDED.store(true, Ordering::Relaxed);
+    blamed(error, limit)
+}
+
+fn blamed(error: EditError, limit: Option<u64>) -> EditError {
     match (error, EXCEEDED.load(Ordering::Relaxed), limit) {
         (EditError::Cancelled { operation }, needed, Some(limit)) if needed > 0 && signal::exit_code().is_none() => {
             let advice = "it was stopped on its way; take a larger voxel size or raise the limit".into();

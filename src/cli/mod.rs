@@ -78,7 +78,7 @@ pub fn main() -> ExitCode {
         memory::watch(&context.run, &reporter);
         let result = dispatch(name, matches, &context);
         context.finish();
-        result.map_err(|error| memory::blamed(error, context.run.memory_limit))
+        result.map_err(|error| memory::ended(error, context.run.memory_limit))
     });
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -61,7 +61,7 @@ fn build(command: Command) -> Command {
                 .conflicts_with_all(["json", "dry-run"])
                 .help(
                     "Run again whenever the recipe or one of its input files changes, until cancelled: only the steps that the change affects; \
-                     pictures appear first, in a quarter of their resolution where most of them has to be drawn",
+                     pictures appear first, in a quarter of their resolution before the whole",
                 ),
         )
         .arg(
@@ -258,13 +258,13 @@ fn text(recipe: &Path, done: &FrameReport, several: bool) -> String {
         let StepReport { op, name, seconds, kept, active_voxels, summary, .. } = step;
         let made = active_voxels.map(|n| format!("{} voxels", table::count(n)));
         let bytes = summary.details.get("bytes").and_then(Value::as_u64).map(size::shown);
-        let tile = |which: &str| summary.details.get("tiles")?.get(which)?.as_u64();
-        let tiles = || Some(format!("{} of {} tiles", tile("drawn")?, tile("all")?));
+        let pixels = summary.details.get("pixels_drawn").and_then(Value::as_u64).map(table::count);
+        let pixels = || pixels.map(|count| format!("{count} pixels"));
         vec![
             (*op).to_owned(),
             name.clone().unwrap_or_default(),
             if *kept { "kept".into() } else { format!("{seconds:.2} s") },
-            made.or(bytes).or_else(tiles).unwrap_or_default(),
+            made.or(bytes).or_else(pixels).unwrap_or_default(),
         ]
     });
     let mut text = format!(

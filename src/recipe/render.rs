@@ -184,7 +184,7 @@ impl Picture {
     }
 
     /// As [`draw`](Self::draw), what has not changed since the last time taken from the last pictures; `coarse` is given a coarse picture
-    /// before, if there is one input and much to be drawn.
+    /// before, if there is one input and anything to be drawn.
     pub fn draw_again(
         &self,
         inputs: &[LevelSet],

@@ -262,7 +262,7 @@ impl Running<'_> {
                 let level_sets: Vec<LevelSet> = inputs.into_iter().map(|slot| slot.level_set).collect();
                 let path = Path::new(&picture.path);
                 let write = |path: &Path, image: &Image| write_atomically(path, |out| image.write_png(out));
-                let mut tiles = None;
+                let mut drawn = None;
                 let image = match &mut self.results {
                     None => {
                         let image = picture.draw(&level_sets, self.run)?;
@@ -273,7 +273,7 @@ impl Running<'_> {
                         let draw = |last: &mut Vec<Redraw>| {
                             let coarse = &mut |image: &Image| write(path, image);
                             let image = picture.draw_again(&level_sets, last, coarse, self.run)?;
-                            tiles = Some(last.iter().map(Redraw::drawn).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1)));
+                            drawn = Some(last.iter().map(Redraw::drawn).sum::<usize>());
                             Ok::<_, EditError>(image)
                         };
                         let image = results.with_pictures(path, draw)?;
@@ -284,8 +284,8 @@ impl Running<'_> {
                 let mut summary = Summary::default();
                 summary.details.insert("width".into(), Value::from(image.width));
                 summary.details.insert("height".into(), Value::from(image.height));
-                if let Some((drawn, all)) = tiles {
-                    summary.details.insert("tiles".into(), json!({ "drawn": drawn, "all": all }));
+                if let Some(drawn) = drawn {
+                    summary.details.insert("pixels_drawn".into(), json!(drawn));
                 }
                 (None, summary)
             }

@@ -2,7 +2,6 @@
 
 use glam::{DVec3, IVec3};
 
-use super::redraw::Blocks;
 use crate::grid::{Grid, LEAF_DIM, LeafId, NeighbourTable, leaf_offset, leaf_origin};
 
 /// A level set's values with the tables that make neighbouring leaves cheap to read.
@@ -49,9 +48,9 @@ impl<'a> Field<'a> {
         self.to_voxels
     }
 
-    /// A reader for one ray or pixel, which remembers the last leaf. The blocks that its rays come through are added to `visited`.
-    pub fn cursor<'c>(&'c self, visited: Option<&'c mut Blocks>) -> Cursor<'c> {
-        Cursor { field: self, origin: IVec3::ZERO, id: self.grid.find(IVec3::ZERO), visited }
+    /// A reader for one ray or pixel, which remembers the last leaf.
+    pub fn cursor(&self) -> Cursor<'_> {
+        Cursor { field: self, origin: IVec3::ZERO, id: self.grid.find(IVec3::ZERO) }
     }
 }
 
@@ -60,8 +59,6 @@ pub(super) struct Cursor<'a> {
     field: &'a Field<'a>,
     origin: IVec3,
     id: LeafId,
-    /// The blocks that rays came through, where somebody wants to know.
-    pub visited: Option<&'a mut Blocks>,
 }
 
 impl Cursor<'_> {
@@ -216,7 +213,7 @@ mod tests {
     fn normals_and_curvature_of_a_sphere() {
         let set: LevelSet = sphere(20.0, 4.0);
         let field = Field::new(set.grid(), set.voxel_size());
-        let mut cursor = field.cursor(None);
+        let mut cursor = field.cursor();
         for (n, p) in points(20.0) {
             let jet = cursor.jet(p);
             // The spline of a distance errs by O(h²/r²) in direction; its curvature by O(h²/r³), plus the smoothing.
@@ -229,7 +226,7 @@ mod tests {
     fn cells_across_leaves_equal_single_voxels() {
         let set = sphere(20.0, 3.0);
         let field = Field::new(set.grid(), set.voxel_size());
-        let mut cursor = field.cursor(None);
+        let mut cursor = field.cursor();
         for (_, p) in points(19.0).chain(points(30.0)) {
             for shift in 0..8 {
                 let cell = p.floor().as_ivec3() + shift;

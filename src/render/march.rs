@@ -46,6 +46,12 @@ impl Ray {
         Self { origin: self.at(t), ..*self }
     }
 
+    /// Whether the ray passes through a box before `t_end`.
+    pub fn meets(&self, bounds: (DVec3, DVec3), t_end: f64) -> bool {
+        let (enter, leave) = self.crossing(bounds);
+        enter <= leave && leave >= 0.0 && enter <= t_end
+    }
+
     /// Entry and exit of a box.
     #[inline(always)]
     fn crossing(&self, (lo, hi): (DVec3, DVec3)) -> (f64, f64) {
@@ -92,9 +98,6 @@ impl Scene<'_> {
         while t < t_end {
             let mut cell = floor(ray.at(t));
             let block = self.skip.block(cell);
-            if let Some(visited) = &mut cursor.visited {
-                visited.insert(self.skip.number(block));
-            }
             if let Some(empty) = self.skip.empty_around(block) {
                 let beyond = ray.crossing(empty).1 + NUDGE;
                 // Rounding may leave a grazing ray in the same block: growing steps get it out.
@@ -279,7 +282,7 @@ mod tests {
         let r = 25.0;
         let set = sphere(r, 3.0);
         let scene = scene(&set);
-        let mut cursor = scene.field.cursor(None);
+        let mut cursor = scene.field.cursor();
         let (mut hits, mut misses) = (0, 0);
         for i in 0..3000 {
             // Rays from all around, aimed at points spread over a cube around the sphere.
@@ -311,7 +314,7 @@ mod tests {
     fn rays_along_the_axes_and_from_the_surface() {
         let set = sphere(25.0, 3.0);
         let scene = scene(&set);
-        let mut cursor = scene.field.cursor(None);
+        let mut cursor = scene.field.cursor();
         for axis in [DVec3::X, DVec3::Y, DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y, DVec3::NEG_Z] {
             let from_outside = Ray::new(axis * -100.0, axis);
             let hit = scene.hit(&mut cursor, &from_outside, Start::Outside, f64::INFINITY).unwrap();

@@ -186,7 +186,7 @@ pub fn render(
         if run.is_cancelled() {
             return Vec::new();
         }
-        let tile = picture.tile(*corner, None);
+        let tile = picture.tile(*corner, None).rgba8;
         task.advance(1);
         tile
     };

@@ -52,16 +52,6 @@ impl Screen {
         }
     }
 
-    /// Whether rays through pixels from `first` up to `end` begin at other distances than on another picture of this size.
-    pub fn differs(&self, other: &Self, first: [i64; 2], end: [i64; 2]) -> bool {
-        let within = |at: i64, size: usize| at.clamp(0, size as i64) as usize;
-        let (left, right) = (within(first[0], self.width), within(end[0], self.width));
-        (within(first[1], self.height)..within(end[1], self.height)).any(|y| {
-            let row = y * self.width + left..y * self.width + right;
-            self.nearest.get(row.clone()) != other.nearest.get(row)
-        })
-    }
-
     /// How far from the eye a ray through a point of the picture may begin. Beyond the picture nothing is known.
     pub fn start(&self, at: DVec2) -> f64 {
         let within = at.cmpge(DVec2::ZERO).all() && at.x < self.width as f64 && at.y < self.height as f64;
@@ -86,7 +76,7 @@ mod tests {
         let transform = set.transform();
         let screen = Screen::new(&scene.skip, &camera, transform, width, height);
         let (mut hits, mut none) = (0, 0);
-        let mut cursor = scene.field.cursor(None);
+        let mut cursor = scene.field.cursor();
         for n in 0..4 * width * height {
             let (n, part) = (n / 4, f64::from(n % 4) / 4.0 + 0.1);
             let at = DVec2::new(f64::from(n % width), f64::from(n / width)) + part;
