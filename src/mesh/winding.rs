@@ -251,12 +251,8 @@ impl<'a> WindingNumber<'a> {
         let middle = (lo + hi) * 0.5;
         let spread = 0.5 * lo.distance(hi);
         // The offsets of the points by coordinate, for arithmetic on several points at once.
-        let mut offsets = [[0.0f32; N]; 3];
-        for lane in 0..N {
-            let offset = points[lane] - middle;
-            (offsets[0][lane], offsets[1][lane], offsets[2][lane]) =
-                (offset.x as f32, offset.y as f32, offset.z as f32);
-        }
+        let exact_offsets: [[f64; N]; 3] = std::array::from_fn(|axis| points.map(|p| p[axis] - middle[axis]));
+        let offsets = exact_offsets.map(|along| along.map(|offset| offset as f32));
         let mut stack = smallvec::SmallVec::<[usize; 64]>::new();
         if !self.far.is_empty() {
             stack.push(0);
@@ -285,11 +281,7 @@ impl<'a> WindingNumber<'a> {
                     if (high - low).max_element() <= F32_EXTENT && !(self.exact_nearby && beside) {
                         add_solid_angles(sums, &offsets, middle, list);
                     } else {
-                        for lane in 0..N {
-                            for &triangle in list {
-                                sums[lane] += solid_angle(points[lane], triangle);
-                            }
-                        }
+                        add_solid_angles(sums, &exact_offsets, middle, list);
                     }
                 }
             }
@@ -308,6 +300,59 @@ impl<const N: usize> Work for SumAngles<'_, N> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         self.winding.add_angles(self.points, self.sums);
+    }
+}
+
+/// Arithmetic of solid angles: f32, or f64 where the plane of a triangle must be told from what lies right beside it.
+trait Real:
+    Copy
+    + PartialOrd
+    + std::ops::Add<Output = Self>
+    + std::ops::Sub<Output = Self>
+    + std::ops::Mul<Output = Self>
+    + std::ops::Div<Output = Self>
+{
+    fn of(value: f64) -> Self;
+    fn to_f32(self) -> f32;
+    fn to_f64(self) -> f64;
+    fn sqrt(self) -> Self;
+}
+
+impl Real for f32 {
+    #[inline(always)]
+    fn of(value: f64) -> Self {
+        value as Self
+    }
+    #[inline(always)]
+    fn to_f32(self) -> f32 {
+        self
+    }
+    #[inline(always)]
+    fn to_f64(self) -> f64 {
+        f64::from(self)
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.sqrt()
+    }
+}
+
+impl Real for f64 {
+    #[inline(always)]
+    fn of(value: f64) -> Self {
+        value
+    }
+    #[inline(always)]
+    fn to_f32(self) -> f32 {
+        self as f32
+    }
+    #[inline(always)]
+    fn to_f64(self) -> f64 {
+        self
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.sqrt()
     }
 }
 
@@ -331,49 +376,53 @@ fn argument(y: f32, x: f32) -> f32 {
 /// Arguments add up where complex numbers multiply: one arctangent serves several triangles, as long as all factors and
 /// products stay in the right half-plane, where nothing wraps around.
 #[inline(always)]
-fn add_solid_angles<const N: usize>(
+fn add_solid_angles<F: Real, const N: usize>(
     sums: &mut [f64; N],
-    offsets: &[[f32; N]; 3],
+    offsets: &[[F; N]; 3],
     middle: DVec3,
     triangles: &[[DVec3; 3]],
 ) {
-    let (mut re, mut im) = ([1.0f32; N], [0.0f32; N]);
+    let zero = F::of(0.0);
+    let dot = |a: [F; 3], b: [F; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    let (mut re, mut im) = ([F::of(1.0); N], [zero; N]);
     for triangle in triangles {
-        let corners = [triangle[0] - middle, triangle[1] - middle, triangle[2] - middle];
-        let corners = [corners[0].as_vec3(), corners[1].as_vec3(), corners[2].as_vec3()];
-        let (mut x, mut y) = ([0.0f32; N], [0.0f32; N]);
-        let (mut product_re, mut product_im) = ([0.0f32; N], [0.0f32; N]);
+        let corners = triangle.map(|corner| (corner - middle).to_array().map(F::of));
+        let (mut x, mut y) = ([zero; N], [zero; N]);
+        let (mut product_re, mut product_im) = ([zero; N], [zero; N]);
         let mut wraps = false;
         for lane in 0..N {
-            let p = glam::Vec3::new(offsets[0][lane], offsets[1][lane], offsets[2][lane]);
-            let [a, b, c] = [corners[0] - p, corners[1] - p, corners[2] - p];
-            let (la, lb, lc) = (a.length(), b.length(), c.length());
-            let scale = 1.0 / (la * lb * lc).max(f32::MIN_POSITIVE);
-            let denominator = la * lb * lc + a.dot(b) * lc + b.dot(c) * la + c.dot(a) * lb;
+            let from = |c: [F; 3]| [c[0] - offsets[0][lane], c[1] - offsets[1][lane], c[2] - offsets[2][lane]];
+            let [a, b, c] = [from(corners[0]), from(corners[1]), from(corners[2])];
+            let (la, lb, lc) = (dot(a, a).sqrt(), dot(b, b).sqrt(), dot(c, c).sqrt());
+            let volume = la * lb * lc;
+            let least = F::of(f64::from(f32::MIN_POSITIVE));
+            let scale = F::of(1.0) / if volume > least { volume } else { least };
+            let denominator = volume + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb;
+            let cross = [b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]];
             x[lane] = denominator * scale;
-            y[lane] = a.dot(b.cross(c)) * scale;
+            y[lane] = dot(a, cross) * scale;
             product_re[lane] = re[lane] * x[lane] - im[lane] * y[lane];
             product_im[lane] = re[lane] * y[lane] + im[lane] * x[lane];
-            wraps |= x[lane] <= 0.0 || product_re[lane] <= 0.0;
+            wraps |= x[lane] <= zero || product_re[lane] <= zero;
         }
         if !wraps {
             (re, im) = (product_re, product_im);
             continue;
         }
         for lane in 0..N {
-            if x[lane] <= 0.0 {
+            if x[lane] <= zero {
                 // In the triangle's plane, the sign of a zero would choose between 2π and −2π.
-                sums[lane] += if y[lane] == 0.0 { 0.0 } else { 2.0 * (y[lane] as f64).atan2(x[lane] as f64) };
-            } else if product_re[lane] > 0.0 {
+                sums[lane] += if y[lane] == zero { 0.0 } else { 2.0 * y[lane].to_f64().atan2(x[lane].to_f64()) };
+            } else if product_re[lane] > zero {
                 (re[lane], im[lane]) = (product_re[lane], product_im[lane]);
             } else {
-                sums[lane] += f64::from(2.0 * argument(im[lane], re[lane]));
+                sums[lane] += f64::from(2.0 * argument(im[lane].to_f32(), re[lane].to_f32()));
                 (re[lane], im[lane]) = (x[lane], y[lane]);
             }
         }
     }
     for lane in 0..N {
-        sums[lane] += f64::from(2.0 * argument(im[lane], re[lane]));
+        sums[lane] += f64::from(2.0 * argument(im[lane].to_f32(), re[lane].to_f32()));
     }
 }
 

@@ -11,7 +11,7 @@ use glam::{DAffine3, DQuat, DVec3};
 
 use super::files::{bytes, name};
 use super::turning::Scan;
-use super::{MOST_PIXELS, RangeMap, RangeSet, is_rigid};
+use super::{MOST_PIXELS, RangeMap, RangeSet, rigid};
 use crate::error::{EditError, Result};
 use crate::run::RunOptions;
 
@@ -29,9 +29,7 @@ pub(super) fn read(path: &Path, run: &RunOptions) -> Result<RangeSet> {
             Some(own) if !own.is_empty() => format!("{} scan {} ({own})", name(path), n + 1),
             _ => format!("{} scan {}", name(path), n + 1),
         };
-        let Some(pose) = pose(&cloud) else {
-            return Err(EditError::input(path, format!("the pose of scan {} is not rigid", n + 1)));
-        };
+        let pose = pose(&cloud).map_err(|problem| EditError::input(path, format!("scan {}: {problem}", n + 1)))?;
         let ordered = cloud.has_row_column();
         if !ordered && cloud.transform.is_none() {
             set.warnings.push(format!(
@@ -78,14 +76,11 @@ pub(super) fn read(path: &Path, run: &RunOptions) -> Result<RangeSet> {
     Ok(set)
 }
 
-fn pose(cloud: &PointCloud) -> Option<DAffine3> {
+fn pose(cloud: &PointCloud) -> Result<DAffine3, String> {
     let Some(::e57::Transform { rotation: q, translation: t }) = &cloud.transform else {
-        return Some(DAffine3::IDENTITY);
+        return Ok(DAffine3::IDENTITY);
     };
-    let turn = DQuat::from_xyzw(q.x, q.y, q.z, q.w);
-    let unit = (turn.length() - 1.0).abs() < 1e-2;
-    let pose = DAffine3::from_rotation_translation(turn.normalize(), DVec3::new(t.x, t.y, t.z));
-    (unit && is_rigid(&pose)).then_some(pose)
+    rigid(DQuat::from_xyzw(q.x, q.y, q.z, q.w), DVec3::new(t.x, t.y, t.z))
 }
 
 /// Points as they come.

@@ -69,7 +69,9 @@ impl RangeSet {
             !empty
         });
         if set.maps.is_empty() {
-            return Err(EditError::input(path, "holds no range map with a measurement"));
+            let why: Vec<&str> = set.warnings.iter().map(String::as_str).take(3).collect();
+            let why = if why.is_empty() { String::new() } else { format!("; {}", why.join("; ")) };
+            return Err(EditError::input(path, format!("holds no range map with a measurement{why}")));
         }
         Ok(set)
     }

@@ -1,6 +1,6 @@
 //! One range map: what a scanner measured along the ray of each pixel, and where it stood.
 
-use glam::{DAffine3, DMat3, DVec2, DVec3};
+use glam::{DAffine3, DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
 /// How pixels and rays belong together, in the scanner's frame. Pixel centres have whole coordinates (u, v).
@@ -338,12 +338,33 @@ impl RangeMap {
     }
 }
 
-/// Whether a map of the world is rigid: neither scaled nor mirrored nor sheared, up to rounding in a file.
-pub fn is_rigid(pose: &DAffine3) -> bool {
+/// A turn and a shift as a pose, refused if the quaternion is not of length 1, up to rounding in a file.
+pub(super) fn rigid(turn: DQuat, shift: DVec3) -> Result<DAffine3, String> {
+    let pose = DAffine3::from_rotation_translation(turn.normalize(), shift);
+    match (turn.length() - 1.0).abs() < 1e-2 {
+        true => check_rigid(&pose).map(|()| pose),
+        false => Err(format!("its pose is not rigid: its quaternion's length is {:.4}, not 1", turn.length())),
+    }
+}
+
+/// Refuses what is no rigid map of the world, up to rounding in a file, and says how it differs.
+pub(super) fn check_rigid(pose: &DAffine3) -> Result<(), String> {
     const TOLERANCE: f64 = 1e-3;
     let m = pose.matrix3;
+    let [x, y, z] = [m.x_axis, m.y_axis, m.z_axis].map(DVec3::length);
     let error = m.transpose() * m - DMat3::IDENTITY;
-    pose.is_finite() && error.to_cols_array().iter().all(|e| e.abs() < TOLERANCE) && m.determinant() > 0.0
+    let how = if !pose.is_finite() {
+        "not all of its numbers are finite".into()
+    } else if [x, y, z].iter().any(|length| (length * length - 1.0).abs() >= TOLERANCE) {
+        format!("it makes lengths of 1 along x, y and z {x:.4}, {y:.4} and {z:.4}")
+    } else if error.to_cols_array().iter().any(|e| e.abs() >= TOLERANCE) {
+        "it shears".into()
+    } else if m.determinant() < 0.0 {
+        "it mirrors".into()
+    } else {
+        return Ok(());
+    };
+    Err(format!("its pose is not rigid: {how}; a rotation and a translation are wanted"))
 }
 
 /// A map of a scanner that delivers a grid of points: the quads and triangles of neighbouring points are drawn into an orthographic map, the nearest in

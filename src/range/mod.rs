@@ -23,5 +23,6 @@ mod toml;
 mod turning;
 
 pub use files::RangeSet;
-pub use map::{Around, Background, MOST_PIXELS, Projection, RangeMap, draw_parallel, is_rigid};
+pub use map::{Around, Background, MOST_PIXELS, Projection, RangeMap, draw_parallel};
+use map::{check_rigid, rigid};
 pub use sight::Sight;

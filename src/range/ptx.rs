@@ -7,7 +7,7 @@ use glam::{DAffine3, DMat4, DVec3};
 
 use super::files::{name, text};
 use super::turning::Scan;
-use super::{MOST_PIXELS, RangeSet, is_rigid};
+use super::{MOST_PIXELS, RangeSet, check_rigid};
 use crate::error::{EditError, Result};
 
 pub(super) fn read(path: &Path) -> Result<RangeSet> {
@@ -43,9 +43,7 @@ pub(super) fn read(path: &Path) -> Result<RangeSet> {
         // Lines of the file are columns of the matrix.
         let pose = DAffine3::from_mat4(DMat4::from_cols_array(&matrix));
         let scan = set.maps.len() + 1;
-        if !is_rigid(&pose) {
-            return Err(EditError::input(path, format!("the pose of scan {scan} is not rigid")));
-        }
+        check_rigid(&pose).map_err(|problem| EditError::input(path, format!("scan {scan}: {problem}")))?;
         // Memory for points follows the lines that there are.
         let (mut points, mut colors) = (Vec::new(), Vec::new());
         for _ in 0..columns * rows {

@@ -10,7 +10,7 @@ use std::path::Path;
 use glam::{DAffine3, DQuat, DVec3};
 
 use super::files::{beside, bytes, name, text};
-use super::{RangeMap, RangeSet, draw_parallel, is_rigid};
+use super::{RangeMap, RangeSet, draw_parallel, rigid};
 use crate::error::{EditError, Result};
 use crate::run::RunOptions;
 
@@ -31,11 +31,9 @@ pub(super) fn read_conf(path: &Path, run: &RunOptions) -> Result<RangeSet> {
         let &[x, y, z, a, b, c, d] = &numbers[..] else {
             return Err(place("seven numbers are wanted, a translation and a quaternion"));
         };
-        let turn = DQuat::from_xyzw(a, b, c, d);
-        if (turn.length() - 1.0).abs() > 1e-2 {
-            return Err(place("the pose is not rigid: the quaternion's length is not 1"));
-        }
-        let pose = DAffine3::from_rotation_translation(turn.normalize().inverse(), DVec3::new(x, y, z));
+        // The file's quaternions turn the other way.
+        let turn = DQuat::from_xyzw(a, b, c, d).conjugate();
+        let pose = rigid(turn, DVec3::new(x, y, z)).map_err(|problem| place(&problem))?;
         let scan = beside(path, file);
         match read_scan(&scan, pose, run)? {
             Some(map) => set.maps.push(map),
@@ -51,9 +49,6 @@ pub(super) fn read_conf(path: &Path, run: &RunOptions) -> Result<RangeSet> {
 /// A scan; `None` if there is no such file.
 pub(super) fn read_scan(path: &Path, pose: DAffine3, run: &RunOptions) -> Result<Option<RangeMap>> {
     run.check("reading")?;
-    if !is_rigid(&pose) {
-        return Err(EditError::input(path, "its pose is not rigid"));
-    }
     let Some(bytes) = bytes(path)? else { return Ok(None) };
     let Grid { points, columns } = grid(&bytes).map_err(|problem| EditError::input(path, problem))?;
     let parallel = super::Projection::Orthographic { first: glam::DVec2::ZERO, pitch: glam::DVec2::ONE };

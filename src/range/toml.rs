@@ -6,7 +6,7 @@ use glam::{DAffine3, DMat4, DVec2};
 use serde::Deserialize;
 
 use super::files::{beside, bytes, name, text};
-use super::{Background, Projection, RangeMap, RangeSet, e57, exr, is_rigid, png, ptx, stanford};
+use super::{Background, Projection, RangeMap, RangeSet, check_rigid, e57, exr, png, ptx, stanford};
 use crate::error::{EditError, Result};
 use crate::run::RunOptions;
 
@@ -113,9 +113,7 @@ pub(super) fn read(path: &Path, run: &RunOptions) -> Result<RangeSet> {
             }
             (None, None) => DAffine3::IDENTITY,
         };
-        if !is_rigid(&pose) {
-            return Err(place("its pose is not rigid: a rotation and a translation are wanted".into()));
-        }
+        check_rigid(&pose).map_err(place)?;
         let file = beside(path, &entry.file);
         let before = set.maps.len();
         if !file.exists() {

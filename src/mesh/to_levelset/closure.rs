@@ -15,6 +15,7 @@ use super::inside::Inside;
 use crate::error::Result;
 use crate::grid::{LEAF_DIM, LeafMask, LeafValues, leaf_offset, leaf_origin};
 use crate::mesh::scatter::UnsignedLeaf;
+use crate::mesh::winding::BATCH;
 use crate::run::RunOptions;
 
 /// Neighbouring voxels whose distances to the triangles add up to more than their own distance are not separated.
@@ -160,7 +161,9 @@ impl<'a> Surroundings<'a> {
 
     /// The quads across open edges, as triangles.
     fn quads(&self, edges: &[OpenEdge], kept: &DistanceLeaves, half_width: f32) -> Vec<[DVec3; 3]> {
-        let crossing: FxHashMap<OpenEdge, f64> = edges.par_iter().map(|&edge| (edge, self.half_level(edge))).collect();
+        let places =
+            edges.par_chunks(BATCH / 2).flat_map_iter(|chunk| chunk.iter().copied().zip(self.half_levels(chunk)));
+        let crossing: FxHashMap<OpenEdge, f64> = places.collect();
         let distance = |ijk: IVec3| kept.find(leaf_origin(ijk)).map_or(half_width, |l| l.0[leaf_offset(ijk)]) as f64;
         let vertex = |cell: IVec3| {
             let mut sum = DVec3::ZERO;
@@ -182,23 +185,30 @@ impl<'a> Surroundings<'a> {
             // An open edge of the cell is always among them.
             sum / f64::max(count, 1.0)
         };
-        edges
-            .par_iter()
-            .flat_map_iter(|edge| {
-                let ijk = IVec3::from_array(edge.ijk);
-                let (u, v) = (AXES[(edge.axis + 1) % 3], AXES[(edge.axis + 2) % 3]);
-                let [a, b, c, d] = [ijk - u - v, ijk - v, ijk, ijk - u].map(vertex);
-                [[a, b, c], [a, c, d]]
-            })
-            .collect()
+        let around = |edge: &OpenEdge| {
+            let ijk = IVec3::from_array(edge.ijk);
+            let (u, v) = (AXES[(edge.axis + 1) % 3], AXES[(edge.axis + 2) % 3]);
+            [ijk - u - v, ijk - v, ijk, ijk - u]
+        };
+        // Each cell lies beside several edges.
+        let mut cells: Vec<IVec3> = edges.iter().flat_map(around).collect();
+        cells.par_sort_unstable_by_key(IVec3::to_array);
+        cells.dedup();
+        let vertices: FxHashMap<IVec3, DVec3> = cells.par_iter().map(|&cell| (cell, vertex(cell))).collect();
+        let quad = |edge| around(edge).map(|cell| vertices[&cell]);
+        edges.iter().map(quad).flat_map(|[a, b, c, d]| [[a, b, c], [a, c, d]]).collect()
     }
 
-    /// Where along an open edge the winding number is ½.
-    fn half_level(&self, edge: OpenEdge) -> f64 {
-        let ijk = IVec3::from_array(edge.ijk);
-        let [a, b] = [ijk, ijk + AXES[edge.axis]].map(|p| self.inside.winding(p) - 0.5);
-        // At the edge of a sheet the two may not bracket ½, where the sign came from crossings.
-        if a * b < 0.0 { a / (a - b) } else { 0.5 }
+    /// Where along open edges that lie near each other, half a batch at most, the winding number is ½.
+    fn half_levels(&self, edges: &[OpenEdge]) -> [f64; BATCH / 2] {
+        let edge = |i: usize| edges[i.min(edges.len() - 1)];
+        let end = |i: usize| IVec3::from_array(edge(i / 2).ijk) + AXES[edge(i / 2).axis] * (i % 2) as i32;
+        let windings = self.inside.windings(&std::array::from_fn(end));
+        std::array::from_fn(|i| {
+            let (a, b) = (windings[2 * i] - 0.5, windings[2 * i + 1] - 0.5);
+            // At the edge of a sheet the two may not bracket ½, where the sign came from crossings.
+            if a * b < 0.0 { a / (a - b) } else { 0.5 }
+        })
     }
 }
 

@@ -3,7 +3,9 @@
 //! A mesh M with a boundary is closed by caps C over the cycles of its boundary. Then w(M) = w(M ∪ C) − w(C): the first is an
 //! integer, counted by crossings along rows, and the second a sum over the few triangles of the caps, nearly zero far from them.
 //! Where all caps together fill less than half of the view from a block of voxels, the integer alone decides; where none passes through
-//! it and their winding number stays clear of ½ and its like, one place decides for all; else every voxel is asked.
+//! it and their winding number stays clear of ½ and its like, one place decides for all. Where the mesh itself does not pass
+//! through it, w(M) is smooth: its values at the corners say what it is between them, up to an error that [`Rim`] bounds. Only
+//! voxels nearer to ½ than that are asked one by one.
 
 use std::f64::consts::PI;
 
@@ -11,6 +13,7 @@ use glam::{DVec3, IVec3};
 use rustc_hash::FxHashMap;
 
 use super::crossings::Crossings;
+use super::rays::crossings_above;
 use super::rim::{Rim, WINDING_ERROR};
 use crate::grid::{LEAF_DIM, LeafMask, leaf_offset};
 use crate::mesh::winding::BATCH;
@@ -22,6 +25,10 @@ const LEVEL: f64 = 0.501;
 const BESIDE: f64 = 0.01;
 /// The part of the view, of ½, up to which caps decide nothing; the rest is for the error of fast winding numbers.
 const HALF: f64 = 0.48;
+/// Voxels along the edge of the smallest blocks.
+const BLOCK: i32 = LEAF_DIM / 2;
+/// Corners of a block say nothing if the error between them might be larger.
+const USELESS: f64 = 0.3;
 /// Where winding numbers of caps are asked for, relative to the voxel: crossings count a voxel on a triangle as above it in
 /// z, and in x and y beyond it, so the caps must be seen from there.
 const ABOVE: DVec3 = DVec3::new(3e-7, 1e-7, 1e-5);
@@ -72,15 +79,16 @@ pub(super) fn caps(positions: &[DVec3], chain: &[([u32; 2], i32)]) -> Vec<[DVec3
 /// Tells inside from outside, leaf by leaf.
 pub(super) struct Inside<'a> {
     crossings: Crossings,
-    tree: &'a Bvh,
+    mesh: &'a Bvh,
+    cap_tree: &'a Bvh,
     caps: WindingNumber<'a>,
     rim: &'a Rim,
 }
 
 impl<'a> Inside<'a> {
-    /// Of a mesh whose crossings, with those of the caps that close it, and boundary are given.
-    pub fn new(crossings: Crossings, caps: &'a Bvh, rim: &'a Rim) -> Self {
-        Self { crossings, tree: caps, caps: WindingNumber::new(caps).exact_nearby(), rim }
+    /// Of a mesh, given with its boundary, the caps that close it, and the crossings of both together.
+    pub fn new(crossings: Crossings, mesh: &'a Bvh, caps: &'a Bvh, rim: &'a Rim) -> Self {
+        Self { crossings, mesh, cap_tree: caps, caps: WindingNumber::new(caps).exact_nearby(), rim }
     }
 
     /// Whether the integer winding number decides in a cube of voxels.
@@ -91,9 +99,17 @@ impl<'a> Inside<'a> {
         self.caps.is_below(center, radius, HALF * 4.0 * PI)
     }
 
-    /// The winding number at a voxel.
-    pub fn winding(&self, ijk: IVec3) -> f64 {
-        f64::from(self.crossings.level(ijk)) - self.caps.at(ijk.as_dvec3() + ABOVE)
+    /// The winding numbers at voxels that lie near each other.
+    pub fn windings(&self, voxels: &[IVec3; BATCH]) -> [f64; BATCH] {
+        let caps = self.caps.at_each(&voxels.map(|ijk| ijk.as_dvec3() + ABOVE));
+        std::array::from_fn(|i| f64::from(self.crossings.level(voxels[i])) - caps[i])
+    }
+
+    /// The winding numbers at points that lie near each other, none of them on a triangle.
+    pub fn windings_at<const N: usize>(&self, points: &[DVec3; N]) -> [f64; N] {
+        let caps = self.caps.at_each(points);
+        let whole = |p| crossings_above(self.mesh, p) + crossings_above(self.cap_tree, p);
+        std::array::from_fn(|i| f64::from(whole(points[i])) - caps[i])
     }
 
     /// The voxels of the leaf at `origin` that are inside.
@@ -102,14 +118,14 @@ impl<'a> Inside<'a> {
             return self.crossings.at_least(origin, level);
         }
         let mut inside = LeafMask::EMPTY;
-        for octant in blocks(LEAF_DIM / 2) {
-            if let Some(level) = self.level_inside(origin + octant, LEAF_DIM / 2) {
+        for i in 0..8 {
+            let block = offset_in(i, 2) * BLOCK;
+            let voxels = (0..BLOCK.pow(3)).map(|i| block + offset_in(i, BLOCK));
+            if let Some(level) = self.level_inside(origin + block, BLOCK) {
                 let mask = self.crossings.at_least(origin, level);
-                (0..(LEAF_DIM / 2).pow(3)).map(|i| leaf_offset(octant + offset_in(i, LEAF_DIM / 2))).for_each(|o| {
-                    inside.set(o, mask.get(o));
-                });
+                voxels.map(leaf_offset).for_each(|o| inside.set(o, mask.get(o)));
             } else {
-                (0..8).for_each(|i| self.by_voxels(origin, octant + offset_in(i, 2) * 2, &mut inside));
+                self.by_voxels(origin, block, &mut inside);
             }
         }
         inside
@@ -126,7 +142,7 @@ impl<'a> Inside<'a> {
         let center = start.as_dvec3() + 0.5 * f64::from(edge - 1);
         let slope = self.rim.steepest(center, radius, 0.5 / radius)?;
         let (lo, hi) = (start.as_dvec3() - BESIDE, (start + edge - 1).as_dvec3() + BESIDE);
-        if self.tree.any_in_box(lo, hi, |_| true) {
+        if self.cap_tree.any_in_box(lo, hi, |_| true) {
             return None;
         }
         let (threshold, error) = (self.caps.at(center) + 0.5, WINDING_ERROR + slope * radius);
@@ -134,20 +150,49 @@ impl<'a> Inside<'a> {
         (level == (threshold + error).floor()).then_some(level as i32 + 1)
     }
 
-    /// Asks for each of the eight voxels from `start` in the leaf at `origin`.
-    fn by_voxels(&self, origin: IVec3, start: IVec3, inside: &mut LeafMask) {
-        let voxels: [IVec3; BATCH] = std::array::from_fn(|i| start + offset_in(i as i32, 2));
-        let caps = self.caps.at_each::<BATCH>(&voxels.map(|v| (origin + v).as_dvec3() + ABOVE));
-        for (v, caps) in voxels.into_iter().zip(caps) {
-            inside.set(leaf_offset(v), f64::from(self.crossings.level(origin + v)) - caps > LEVEL);
+    /// Asks for the voxels of the block at `block` in the leaf at `origin`: for all of them, or for the corners and those that
+    /// these leave open.
+    fn by_voxels(&self, origin: IVec3, block: IVec3, inside: &mut LeafMask) {
+        let corners: [IVec3; BATCH] = std::array::from_fn(|i| origin + block + offset_in(i as i32, 2) * (BLOCK - 1));
+        let between = self.error_between(origin + block).map(|error| (self.windings(&corners), error));
+        let mut asked = smallvec::SmallVec::<[IVec3; 64]>::new();
+        // In cubes of eight, which are asked together.
+        for i in 0..BLOCK.pow(3) {
+            let local = offset_in(i / 8, 2) * 2 + offset_in(i % 8, 2);
+            let mut set = |value| inside.set(leaf_offset(block + local), value);
+            match between.map(|(corners, error)| (trilinear(&corners, local.as_dvec3() / f64::from(BLOCK - 1)), error))
+            {
+                Some((w, error)) if (w - LEVEL).abs() > error => set(w > LEVEL),
+                _ => asked.push(block + local),
+            }
         }
+        for voxels in asked.chunks(BATCH) {
+            let batch = std::array::from_fn(|i| origin + voxels[i.min(voxels.len() - 1)]);
+            for (v, w) in voxels.iter().zip(self.windings(&batch)) {
+                inside.set(leaf_offset(*v), w > LEVEL);
+            }
+        }
+    }
+
+    /// How far the winding number in a block may be from what its corners say; `None` where the mesh passes through it or
+    /// they say nothing.
+    ///
+    /// Linear interpolation over a length h is off by no more than h²/8 times the second derivative.
+    fn error_between(&self, start: IVec3) -> Option<f64> {
+        let length = f64::from(BLOCK - 1);
+        let (center, radius) = (start.as_dvec3() + 0.5 * length, 0.87 * length);
+        let factor = length * length / 8.0;
+        let bent = self.rim.most_bent(center, radius, USELESS / factor)?;
+        let (lo, hi) = (start.as_dvec3() - BESIDE, start.as_dvec3() + length + BESIDE);
+        (!self.mesh.any_in_box(lo, hi, |_| true)).then_some(bent * factor)
     }
 }
 
-/// The first voxels of the cubes of `edge` that make up a leaf.
-fn blocks(edge: i32) -> impl Iterator<Item = IVec3> {
-    let count = LEAF_DIM / edge;
-    (0..count.pow(3)).map(move |i| offset_in(i, count) * edge)
+/// The value at `at` in the unit cube with these values at its corners, the last coordinate running fastest.
+fn trilinear(corners: &[f64; 8], at: DVec3) -> f64 {
+    let mix = |a: f64, b: f64, t: f64| a + (b - a) * t;
+    let along_z = |i: usize| mix(corners[i], corners[i + 1], at.z);
+    mix(mix(along_z(0), along_z(2), at.y), mix(along_z(4), along_z(6), at.y), at.x)
 }
 
 /// The voxel number `i` of a cube.
@@ -172,8 +217,8 @@ mod tests {
         let crossings = Crossings::new(count + caps.len(), corners);
         let closing = Bvh::new(caps.clone());
         let rim = Rim::new(&mesh.positions, &chain);
-        let inside = Inside::new(crossings, &closing, &rim);
         let whole = Bvh::new((0..count).map(|t| mesh.corners(t)).collect());
+        let inside = Inside::new(crossings, &whole, &closing, &rim);
         let winding = WindingNumber::new(&whole);
         let (lo, hi) = mesh.bounding_box().unwrap();
         let (lo, hi) = ((lo / 8.0).floor().as_ivec3() - 1, (hi / 8.0).floor().as_ivec3() + 1);
@@ -188,7 +233,8 @@ mod tests {
                 let on_surface = whole.closest_point(ijk.as_dvec3(), 1e-3).is_some();
                 let w = winding.at(ijk.as_dvec3());
                 assert!(on_surface || (w - 0.5).abs() < 0.03 || mask.get(o) == (w > 0.5), "{ijk}: {w}");
-                assert!(on_surface || (inside.winding(ijk) - w).abs() < 0.03, "{ijk}: {w} {}", inside.winding(ijk));
+                let [own, ..] = inside.windings(&[ijk; BATCH]);
+                assert!(on_surface || (own - w).abs() < 0.03, "{ijk}: {w} {own}");
             }
         }
         assert!(by_integer > 0);

@@ -8,46 +8,62 @@ use crate::mesh::Bvh;
 /// Triangles nearer than this (voxels) touch: rounding must not hide that two coincide.
 const TOUCH: f64 = 1e-3;
 
-/// Marks the triangles that another one crosses, overlaps or touches otherwise than at the vertices that they share.
-/// Only those with a mark in `asked` are looked at. `bvh` holds the triangles of the indexed mesh in its order. Neighbours over
-/// an edge are not looked at.
-pub(super) fn intersecting(bvh: &Bvh, positions: &[DVec3], triangles: &[[u32; 3]], asked: &[bool]) -> Vec<bool> {
-    let corners = |t: u32| triangles[t as usize].map(|v| positions[v as usize]);
-    (0..triangles.len() as u32)
-        .into_par_iter()
-        .with_min_len(256)
-        .map(|t| {
-            if !asked[t as usize] {
-                return false;
-            }
-            let own = corners(t);
-            let (lo, hi) = (own[0].min(own[1]).min(own[2]) - TOUCH, own[0].max(own[1]).max(own[2]) + TOUCH);
-            bvh.any_in_box(lo, hi, |other| {
-                if other == t {
+/// The triangles of an indexed mesh that cross, overlap or touch each other otherwise than at the vertices that they share.
+/// Neighbours over an edge are not looked at.
+pub(super) struct Intersections<'a> {
+    /// Holds the triangles in their order.
+    pub bvh: &'a Bvh,
+    pub positions: &'a [DVec3],
+    pub triangles: &'a [[u32; 3]],
+}
+
+impl Intersections<'_> {
+    /// Marks the triangles that another one crosses, of those with a mark in `asked`.
+    pub fn marks(&self, asked: &[bool]) -> Vec<bool> {
+        (0..self.triangles.len() as u32)
+            .into_par_iter()
+            .with_min_len(256)
+            .map(|t| asked[t as usize] && self.near(self.corners(t), |other| self.cross(t, other)))
+            .collect()
+    }
+
+    /// Whether one that crosses triangle `t` touches this part of it.
+    pub fn touch_part(&self, t: u32, part: [DVec3; 3]) -> bool {
+        self.near(part, |other| touch(part, self.corners(other)) && self.cross(t, other))
+    }
+
+    fn corners(&self, t: u32) -> [DVec3; 3] {
+        self.triangles[t as usize].map(|v| self.positions[v as usize])
+    }
+
+    /// Whether `f` holds for a triangle whose box is near that of another.
+    fn near(&self, [a, b, c]: [DVec3; 3], f: impl Fn(u32) -> bool) -> bool {
+        self.bvh.any_in_box(a.min(b).min(c) - TOUCH, a.max(b).max(c) + TOUCH, f)
+    }
+
+    fn cross(&self, t: u32, other: u32) -> bool {
+        if other == t {
+            return false;
+        }
+        let (own, others) = (&self.triangles[t as usize], &self.triangles[other as usize]);
+        match own.iter().filter(|v| others.contains(v)).count() {
+            0 => touch(self.corners(t), self.corners(other)),
+            1 => {
+                // Beyond the vertex they meet if and only if the edge opposite to it of one meets the other.
+                let far_edge = |a: &[u32; 3], b: &[u32; 3]| {
+                    let mut rest = a.iter().filter(|v| !b.contains(v)).map(|&v| self.positions[v as usize]);
+                    Some([rest.next()?, rest.next()?])
+                };
+                let (Some(own_far), Some(other_far)) = (far_edge(own, others), far_edge(others, own)) else {
                     return false;
-                }
-                let shared = |v: &u32| triangles[other as usize].contains(v);
-                match triangles[t as usize].iter().filter(|v| shared(v)).count() {
-                    0 => touch(own, corners(other)),
-                    1 => {
-                        // Beyond the vertex they meet if and only if the edge opposite to it of one meets the other.
-                        let far_edge = |a: u32, b: u32| {
-                            let common = |v: &&u32| triangles[b as usize].contains(v);
-                            let mut rest =
-                                triangles[a as usize].iter().filter(|v| !common(v)).map(|&v| positions[v as usize]);
-                            Some([rest.next()?, rest.next()?])
-                        };
-                        let (Some(own_far), Some(other_far)) = (far_edge(t, other), far_edge(other, t)) else {
-                            return false;
-                        };
-                        let meets = |[a, b]: [DVec3; 2], triangle| touch([a, b, b], triangle);
-                        !bisected(own, own_far, other_far) && (meets(own_far, corners(other)) || meets(other_far, own))
-                    }
-                    _ => false,
-                }
-            })
-        })
-        .collect()
+                };
+                let meets = |[a, b]: [DVec3; 2], triangle| touch([a, b, b], triangle);
+                !bisected(self.corners(t), own_far, other_far)
+                    && (meets(own_far, self.corners(other)) || meets(other_far, self.corners(t)))
+            }
+            _ => false,
+        }
+    }
 }
 
 /// Whether the plane through the vertex that two triangles share, square to the difference of the directions in which they
@@ -89,7 +105,8 @@ mod tests {
     fn count(mesh: &TriangleMesh) -> usize {
         let bvh = Bvh::new((0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect());
         let asked = vec![true; mesh.triangles.len()];
-        intersecting(&bvh, &mesh.positions, &mesh.triangles, &asked).iter().filter(|&&i| i).count()
+        let all = Intersections { bvh: &bvh, positions: &mesh.positions, triangles: &mesh.triangles };
+        all.marks(&asked).iter().filter(|&&i| i).count()
     }
 
     #[test]

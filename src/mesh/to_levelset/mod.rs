@@ -13,6 +13,7 @@ mod crossings;
 mod inside;
 mod intersect;
 mod pieces;
+mod rays;
 mod rim;
 
 use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
@@ -124,9 +125,9 @@ pub fn mesh_to_level_set(
             signed(origin, distance, &crossings.inside(origin), params)
         })?
     } else {
-        let caps = Bvh::new(caps);
+        let (tree, caps) = (Bvh::new((0..count).map(corners).collect()), Bvh::new(caps));
         let rim = Rim::new(&clean.positions, &chain);
-        let doubts = Doubts { inside: Inside::new(crossings, &caps, &rim), overlaps, rim: &rim };
+        let doubts = Doubts { inside: Inside::new(crossings, &tree, &caps, &rim), overlaps, tree: &tree, rim: &rim };
         vec![repair(&clean, &doubts, params, &mut findings, run)?]
     };
     let level_set = LevelSet::new(grid_of_parts(background, &leaves), transform);
@@ -141,6 +142,8 @@ struct Doubts<'a> {
     inside: Inside<'a>,
     /// Leaves where it overlaps itself.
     overlaps: Vec<IVec3>,
+    /// Its triangles, in their order.
+    tree: &'a Bvh,
     rim: &'a Rim,
 }
 
@@ -173,10 +176,13 @@ fn repair(
     let half_width = params.half_width;
     let doubtful = doubts.triangles(clean);
     run.check(OPERATION)?;
-    let pieces = separating_pieces(&clean.positions, &clean.triangles, &doubtful, doubts.rim, run)?;
+
+    let pieces = separating_pieces(clean, &doubtful, doubts, run)?;
+
     findings.removed_area_fraction = pieces.removed_area_fraction;
     run.check(OPERATION)?;
     let mut kept = DistanceLeaves::new(distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?);
+
     // The surface may go on where triangles were left out.
     let suspects: Vec<IVec3> = if pieces.removed_area_fraction > 0.0 {
         let marked: Vec<usize> = (0..doubtful.len()).filter(|&t| doubtful[t]).collect();
@@ -187,10 +193,13 @@ fn repair(
     };
     let mut surroundings = Surroundings::new(&doubts.inside);
     let closure = surroundings.close(&kept, &suspects, half_width, run)?;
+
     findings.closure_triangles = closure.len();
     kept.merge(distance_to_triangles(closure.len(), |t| closure[t], half_width, run)?);
+
     let unsigned: Vec<_> = kept.origins().filter(|o| surroundings.mask(*o).is_none()).collect();
     surroundings.extend(&unsigned);
+
     let signed = |leaf: &UnsignedLeaf| {
         signed(leaf.origin, &leaf.distance, &surroundings.mask(leaf.origin).copied().unwrap_or_default(), params)
     };

@@ -4,19 +4,22 @@
 //! a sheet, both sides are outside. A piece counts if the winding number is above ½ on one of its sides and not on the other.
 //!
 //! In front of triangles that no others touch the winding number changes only because of the mesh's boundary, and no faster
-//! than [`Rim`] says: connected ones are judged together, by one point, as far as that goes. Others are cut into pieces of at most
-//! [`COARSE`] voxels, and where pieces that count lie beside pieces that do not, further down to [`FINE`].
+//! than [`Rim`] says: connected ones are judged together, by one point, as far as that goes. Others are halved until that goes for
+//! their parts, or they are pieces of at most [`COARSE`] voxels, and where pieces that count lie beside pieces that do not, further
+//! down to [`FINE`].
 
 use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::intersect::intersecting;
+use super::Doubts;
+use super::inside::Inside;
+use super::intersect::Intersections;
 use super::rim::{Rim, WINDING_ERROR};
 use crate::error::Result;
+use crate::mesh::TriangleMesh;
 use crate::mesh::topology::{by_edge, edge_uses};
 use crate::mesh::winding::BATCH;
-use crate::mesh::{Bvh, WindingNumber};
 use crate::run::RunOptions;
 
 /// Longest edge, in voxels, of the pieces that are judged first.
@@ -63,6 +66,11 @@ impl Piece {
         self.corners.iter().map(|c| c.distance_squared(center)).fold(0.0, f64::max).sqrt()
     }
 
+    fn longest_edge(&self) -> f64 {
+        let [a, b, c] = self.corners;
+        a.distance(b).max(b.distance(c)).max(c.distance(a))
+    }
+
     /// A point just beside it, in front of it or behind it.
     fn beside(&self, side: f64) -> DVec3 {
         let [a, b, c] = self.corners;
@@ -78,53 +86,72 @@ impl Piece {
 
 /// Cuts and judges the triangles of an indexed mesh in index space that have a mark in `doubtful`; the others are known to count.
 pub(super) fn separating_pieces(
-    positions: &[DVec3],
-    triangles: &[[u32; 3]],
+    mesh: &TriangleMesh,
     doubtful: &[bool],
-    rim: &Rim,
+    doubts: &Doubts<'_>,
     run: &RunOptions,
 ) -> Result<Pieces> {
-    let whole = |t: u32| Piece { triangle: t, corners: triangles[t as usize].map(|v| positions[v as usize]) };
+    let triangles = &mesh.triangles;
+    let whole = |t: u32| Piece { triangle: t, corners: mesh.corners(t as usize) };
     let total: f64 = (0..triangles.len() as u32).map(|t| area(&whole(t).corners)).sum();
     let mut removed = 0.0;
     let mut kept = Vec::new();
-    let bvh = &Bvh::new((0..triangles.len() as u32).map(|t| whole(t).corners).collect());
-    let winding = &WindingNumber::new(bvh);
-    // In the order of the tree, so that those judged together lie together.
-    let crossed = intersecting(bvh, positions, triangles, doubtful);
+    let &Doubts { tree, ref inside, rim, .. } = doubts;
+    let intersections = Intersections { bvh: tree, positions: &mesh.positions, triangles };
+    let crossed = intersections.marks(doubtful);
     let sure = doubtful.iter().map(|doubtful| (!doubtful).then_some(true)).collect();
-    let verdicts = verdicts_together(&whole, triangles, sure, &crossed, winding, rim);
-    let mut open = Vec::new();
-    for piece in bvh.order().into_iter().map(whole) {
+    let verdicts = verdicts_together(&whole, triangles, sure, &crossed, inside, rim);
+    let mut undecided = Vec::new();
+    // In the order of the tree, so that those judged together lie together.
+    for piece in tree.order().into_iter().map(whole) {
         match verdicts[piece.triangle as usize] {
             Some(true) => kept.push(piece.corners),
             Some(false) => removed += area(&piece.corners),
-            None => open.push(piece),
+            None => undecided.push(piece),
         }
     }
+    let touched =
+        |piece: &Piece| crossed[piece.triangle as usize] && intersections.touch_part(piece.triangle, piece.corners);
+    let check = |pieces: usize| {
+        let bytes = pieces * 4 * std::mem::size_of::<Piece>();
+        let advice = "the mesh is open or overlaps itself in many places; take a larger voxel_size";
+        run.check("mesh to level set")?;
+        run.reserve("mesh to level set", bytes as u64, advice)
+    };
+    let mut open = Vec::new();
+    while !undecided.is_empty() {
+        check(undecided.len() + open.len() + kept.len())?;
+        let verdicts = judge_by_front(&undecided, touched, inside, rim);
+        let mut next = Vec::new();
+        for (piece, verdict) in undecided.into_iter().zip(verdicts) {
+            match verdict {
+                Some(true) => kept.push(piece.corners),
+                Some(false) => removed += area(&piece.corners),
+                None if piece.longest_edge() <= COARSE => open.push(piece),
+                None => next.extend(piece.cut((0.5 * piece.longest_edge()).max(COARSE))),
+            }
+        }
+        undecided = next;
+    }
     let mut size = COARSE;
-    let mut open: Vec<Piece> = open.par_iter().flat_map_iter(|piece| piece.cut(COARSE)).collect();
     let limit = FEW.max(GROWTH * open.len());
     while !open.is_empty() {
-        run.check("mesh to level set")?;
-        let bytes = (open.len() + kept.len()) * 4 * std::mem::size_of::<Piece>();
-        run.reserve(
-            "mesh to level set",
-            bytes as u64,
-            "the mesh overlaps itself in many places; take a larger voxel_size",
-        )?;
-        let fronts = by_batches(&open, 1.0, winding);
-        let backs = by_batches(&open, -1.0, winding);
-        let counts: Vec<bool> =
-            fronts.iter().zip(&backs).map(|(front, back)| (*front > 0.5) != (*back > 0.5)).collect();
+        check(open.len() + kept.len())?;
+        let sure = judge_by_front(&open, touched, inside, rim);
+        let unsure: Vec<usize> = (0..open.len()).filter(|&i| sure[i].is_none()).collect();
+        let [fronts, backs] = [1.0, -1.0].map(|side| windings(unsure.len(), |i| open[unsure[i]].beside(side), inside));
+        let mut counts: Vec<bool> = sure.iter().map(|sure| sure.unwrap_or_default()).collect();
+        for ((i, front), back) in unsure.into_iter().zip(fronts).zip(backs) {
+            counts[i] = (front > 0.5) != (back > 0.5);
+        }
         let border = if size > FINE && open.len() < limit {
             borders(&open, &counts, size, triangles)
         } else {
             vec![false; open.len()]
         };
         let mut next = Vec::new();
-        for ((piece, counts), border) in open.into_iter().zip(counts).zip(border) {
-            match (border, counts) {
+        for (i, piece) in open.into_iter().enumerate() {
+            match (border[i] && sure[i].is_none(), counts[i]) {
                 (true, _) => next.extend(piece.cut(size / 2.0)),
                 (false, true) => kept.push(piece.corners),
                 (false, false) => removed += area(&piece.corners),
@@ -142,7 +169,7 @@ fn verdicts_together(
     triangles: &[[u32; 3]],
     mut verdicts: Vec<Option<bool>>,
     crossed: &[bool],
-    winding: &WindingNumber<'_>,
+    inside: &Inside<'_>,
     rim: &Rim,
 ) -> Vec<Option<bool>> {
     const NONE: u32 = u32::MAX;
@@ -167,7 +194,7 @@ fn verdicts_together(
         }
         let piece = whole(seed);
         let center = piece.center();
-        let front = winding.at(piece.beside(1.0));
+        let [front] = inside.windings_at(&[piece.beside(1.0)]);
         let own = piece.radius_about(center);
         let widest = if rim.is_empty() { f64::MAX } else { TOGETHER.max(2.0 * own) };
         // The verdict for all triangles within some distance, or at least for this one.
@@ -190,6 +217,31 @@ fn verdicts_together(
     verdicts
 }
 
+/// Whether all of a piece counts, as far as the winding number in front of its middle tells.
+fn judge_by_front(
+    pieces: &[Piece],
+    touched: impl Fn(&Piece) -> bool + Sync,
+    inside: &Inside<'_>,
+    rim: &Rim,
+) -> Vec<Option<bool>> {
+    // How far the winding number may be off elsewhere in front; most pieces near the boundary are passed over here.
+    let error = |piece: &Piece| {
+        let center = piece.center();
+        let radius = piece.radius_about(center);
+        let slope = rim.steepest(center, radius, 0.5 / radius.max(f64::MIN_POSITIVE))?;
+        (!touched(piece)).then_some(WINDING_ERROR + slope * radius)
+    };
+    let errors: Vec<Option<f64>> = pieces.par_iter().map(error).collect();
+    let asked: Vec<usize> = (0..pieces.len()).filter(|&i| errors[i].is_some()).collect();
+    let mut verdicts = vec![None; pieces.len()];
+    for (&i, front) in asked.iter().zip(windings(asked.len(), |i| pieces[asked[i]].beside(1.0), inside)) {
+        // Behind it the winding number is one more.
+        let clear = errors[i].is_some_and(|error| (front.abs() - 0.5).abs() > error);
+        verdicts[i] = clear.then_some(front.abs() < 0.5);
+    }
+    verdicts
+}
+
 /// Whether the winding number in front of connected triangles within `radius` of `center` stays as far from ½ and −½, where
 /// their verdict changes, as `front` shows it to be.
 fn decides(front: f64, center: DVec3, radius: f64, rim: &Rim) -> bool {
@@ -197,13 +249,13 @@ fn decides(front: f64, center: DVec3, radius: f64, rim: &Rim) -> bool {
     (front.abs() - 0.5).abs() > WINDING_ERROR + slope * radius
 }
 
-/// Winding numbers beside each piece.
-fn by_batches(pieces: &[Piece], side: f64, winding: &WindingNumber<'_>) -> Vec<f64> {
-    let batch = |chunk: &[Piece]| {
-        let point = |i: usize| chunk.get(i).or(chunk.last()).map_or(DVec3::ZERO, |piece| piece.beside(side));
-        winding.at_each::<BATCH>(&std::array::from_fn(point)).into_iter().take(chunk.len())
+/// Winding numbers at points that lie near those before them.
+fn windings(count: usize, point: impl Fn(usize) -> DVec3 + Sync, inside: &Inside<'_>) -> Vec<f64> {
+    let batch = |first: usize| {
+        let points = std::array::from_fn(|i| point((first + i).min(count - 1)));
+        inside.windings_at::<BATCH>(&points).into_iter().take(count - first)
     };
-    pieces.par_chunks(BATCH).flat_map_iter(batch).collect()
+    (0..count).into_par_iter().step_by(BATCH).flat_map_iter(batch).collect()
 }
 
 /// Which pieces lie beside a piece of the other kind on the same surface: of the same triangle or one that shares a vertex.
@@ -293,14 +345,24 @@ fn slice([from, to, apex]: [DVec3; 3], size: f64, done: &mut Vec<[DVec3; 3]>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::TriangleMesh;
+    use crate::mesh::Bvh;
     use crate::mesh::testing::*;
+    use crate::mesh::to_levelset::crossings::Crossings;
+    use crate::mesh::to_levelset::inside::caps;
     use crate::mesh::topology::boundary_chain;
 
     fn pieces(mesh: &TriangleMesh) -> Pieces {
-        let rim = Rim::new(&mesh.positions, &boundary_chain(&edge_uses(&mesh.triangles)));
-        let doubtful = vec![true; mesh.triangles.len()];
-        separating_pieces(&mesh.positions, &mesh.triangles, &doubtful, &rim, &RunOptions::default()).unwrap()
+        let chain = boundary_chain(&edge_uses(&mesh.triangles));
+        let caps = caps(&mesh.positions, &chain);
+        let count = mesh.triangles.len();
+        let crossings = Crossings::new(count + caps.len(), |t| {
+            caps.get(t.wrapping_sub(count)).copied().unwrap_or_else(|| mesh.corners(t))
+        });
+        let (tree, caps) = (Bvh::new((0..count).map(|t| mesh.corners(t)).collect()), Bvh::new(caps));
+        let rim = Rim::new(&mesh.positions, &chain);
+        let doubts =
+            Doubts { inside: Inside::new(crossings, &tree, &caps, &rim), overlaps: Vec::new(), tree: &tree, rim: &rim };
+        separating_pieces(mesh, &vec![true; count], &doubts, &RunOptions::default()).unwrap()
     }
 
     #[test]

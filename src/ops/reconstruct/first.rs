@@ -3,7 +3,6 @@
 use fearless_simd::{Select, Simd, SimdBase};
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
 
 use super::NAME;
 use super::forces::{CUT, Forces, Sampled, Term, window};
@@ -207,46 +206,35 @@ impl Forces<'_> {
         Ok(LevelSet::new(grid, self.transform))
     }
 }
+
 /// A surface as triangles, without its small pieces: those that enclose less than a part of what the largest does are specks or bubbles. Says how many went.
 pub(super) fn without_specks(level_set: &LevelSet, part: f64, run: &RunOptions) -> Result<(TriangleMesh, usize)> {
     let mesh = level_set_to_mesh(level_set, 0.0, run)?;
     let pieces = pieces(&mesh);
-    let volume = |triangles: &[[u32; 3]]| {
-        let at = |v: u32| mesh.positions[v as usize];
-        let reference = triangles.first().map_or(DVec3::ZERO, |t| at(t[0]));
-        let sixth = |t: &[u32; 3]| {
-            let [a, b, c] = t.map(|v| at(v) - reference);
-            a.dot(b.cross(c)) / 6.0
-        };
-        triangles.iter().map(sixth).sum::<f64>().abs()
-    };
-    let volumes: Vec<f64> = pieces.iter().map(|piece| volume(piece)).collect();
-    let largest = volumes.iter().copied().fold(0.0, f64::max);
-    let gone = volumes.iter().filter(|volume| **volume < part * largest).count();
+    // Six times what a piece encloses, by its first vertex.
+    let mut volumes: Vec<Option<f64>> = vec![None; mesh.positions.len()];
+    for triangle in &mesh.triangles {
+        let piece = pieces[triangle[0] as usize] as usize;
+        let [a, b, c] = triangle.map(|v| mesh.positions[v as usize] - mesh.positions[piece]);
+        *volumes[piece].get_or_insert(0.0) += a.dot(b.cross(c));
+    }
+    let largest = volumes.iter().flatten().fold(0.0, |most: f64, volume| most.max(volume.abs()));
+    let is_speck = |volume: f64| volume.abs() < part * largest;
+    let gone = volumes.iter().flatten().filter(|volume| is_speck(**volume)).count();
     if gone == 0 {
         return Ok((mesh, 0));
     }
-    let kept = pieces.iter().zip(&volumes).filter(|(_, volume)| **volume >= part * largest);
-    let triangles = kept.flat_map(|(piece, _)| piece.iter().copied()).collect();
+    let triangles =
+        mesh.triangles.into_iter().filter(|t| !volumes[pieces[t[0] as usize] as usize].is_some_and(is_speck)).collect();
     Ok((TriangleMesh { triangles, ..mesh }, gone))
 }
 
-/// The triangles of each connected piece, in the order of their first.
-fn pieces(mesh: &TriangleMesh) -> Vec<Vec<[u32; 3]>> {
+/// The first vertex of the connected piece to which each vertex belongs.
+fn pieces(mesh: &TriangleMesh) -> Vec<u32> {
     let joined = UnionFind::new(mesh.positions.len());
-    for &[a, b, c] in &mesh.triangles {
+    mesh.triangles.par_iter().with_min_len(4096).for_each(|&[a, b, c]| {
         joined.join(a, b);
         joined.join(b, c);
-    }
-    let mut place: FxHashMap<u32, usize> = FxHashMap::default();
-    let mut pieces: Vec<Vec<[u32; 3]>> = Vec::new();
-    for triangle in &mesh.triangles {
-        let root = joined.root(triangle[0]);
-        let n = *place.entry(root).or_insert_with(|| {
-            pieces.push(Vec::new());
-            pieces.len() - 1
-        });
-        pieces[n].push(*triangle);
-    }
-    pieces
+    });
+    (0..mesh.positions.len()).into_par_iter().with_min_len(4096).map(|v| joined.root(v as u32)).collect()
 }

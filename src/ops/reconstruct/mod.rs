@@ -18,6 +18,7 @@
 //! without noise and prior within 0.08 voxel. From six maps of cameras at five radii the volume is within 1 % with β = 1 and 3 % too small with β = 2:
 //! a camera sees less than half of a solid, so that a point is seen by 1.6 maps in the mean instead of 2.0, and 2βH over that is the shift.
 //! ρ takes the surface for flat along the ray, which errs at grazing angles.
+//! The ten scans of the bunny at 256 voxels (`compare` with the published mesh): the first surface is 0.31 voxel RMS off, 6.0 at worst, the flow's end 0.20 and 3.4.
 
 mod first;
 mod fit;
