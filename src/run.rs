@@ -23,6 +23,8 @@ pub trait Progress: Send + Sync {
 pub struct RunOptions {
     /// Bytes that the run may use; `None` is no limit.
     pub memory_limit: Option<u64>,
+    /// Bytes in use, of the limit, before more is reserved.
+    in_use: Option<fn() -> u64>,
     cancel: Arc<AtomicBool>,
     progress: Option<Arc<dyn Progress>>,
 }
@@ -31,6 +33,12 @@ impl RunOptions {
     /// The same run, reporting to `progress`.
     pub fn with_progress(mut self, progress: Arc<dyn Progress>) -> Self {
         self.progress = Some(progress);
+        self
+    }
+
+    /// The same run, whose memory limit is for all that `in_use` says, what was there before included: for a process of its own.
+    pub fn with_memory_in_use(mut self, in_use: fn() -> u64) -> Self {
+        self.in_use = Some(in_use);
         self
     }
 
@@ -49,11 +57,25 @@ impl RunOptions {
         if self.is_cancelled() { Err(EditError::Cancelled { operation: operation.into() }) } else { Ok(()) }
     }
 
+    /// Bytes of the limit that are in use; 0 where the limit is for the run alone.
+    pub fn memory_in_use(&self) -> u64 {
+        self.in_use.map_or(0, |in_use| in_use())
+    }
+
     /// [`EditError::Memory`] if `bytes` more than what is in use would exceed the limit; `advice` says what needs less.
     pub fn reserve(&self, operation: &str, bytes: u64, advice: &str) -> Result<()> {
         match self.memory_limit {
-            Some(limit) if bytes > limit => {
-                Err(EditError::Memory { operation: operation.into(), needed: bytes, limit, advice: advice.into() })
+            Some(_) => self.reserve_since(self.memory_in_use(), operation, bytes, advice),
+            None => Ok(()),
+        }
+    }
+
+    /// As [`reserve`](Self::reserve), for work that takes its memory bit by bit: `bytes` in all since `before` were in use.
+    pub fn reserve_since(&self, before: u64, operation: &str, bytes: u64, advice: &str) -> Result<()> {
+        let needed = before.saturating_add(bytes);
+        match self.memory_limit {
+            Some(limit) if needed > limit => {
+                Err(EditError::Memory { operation: operation.into(), needed, limit, advice: advice.into() })
             }
             _ => Ok(()),
         }

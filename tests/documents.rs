@@ -57,3 +57,24 @@ fn the_how_tos_work() {
 fn the_readme_works() {
     run("README.md", 1);
 }
+
+/// The pages of two operators; all of them, with their pictures, are run by `make nightly`.
+#[test]
+fn pages_of_operators_work() {
+    for name in ["offset", "csg"] {
+        run(&format!("docs/operators/{name}.md"), 1);
+    }
+}
+
+#[test]
+#[ignore = "some minutes: part of make nightly"]
+fn the_pages_of_all_operators_work() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/operators");
+    for entry in std::fs::read_dir(folder).unwrap().flatten() {
+        let name = entry.file_name().into_string().unwrap();
+        // The list, and one whose inputs are not part of the project.
+        if name.ends_with(".md") && !["README.md", "reconstruct.md"].contains(&name.as_str()) {
+            run(&format!("docs/operators/{name}"), 1);
+        }
+    }
+}

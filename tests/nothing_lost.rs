@@ -102,6 +102,58 @@ fn a_write_that_finds_no_room_leaves_the_old_file() {
     assert_eq!(fs::read_dir(folder).unwrap().count(), 1);
 }
 
+/// A file system in memory, mounted on a folder until it is dropped.
+struct Disk<'a>(&'a Path);
+
+impl<'a> Disk<'a> {
+    /// `None`, said on standard error, where mounting is not allowed.
+    fn mount(folder: &'a Path, size: &str) -> Option<Self> {
+        let options = format!("size={size}");
+        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", &options, "tmpfs"]).arg(folder).output();
+        if mounted.is_ok_and(|output| output.status.success()) {
+            return Some(Self(folder));
+        }
+        eprintln!("SKIPPED: no file system can be mounted on {}", folder.display());
+        None
+    }
+}
+
+impl Drop for Disk<'_> {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg(self.0).status();
+    }
+}
+
+/// A disk that is full for the new file, and has room for it once something else is gone.
+#[test]
+fn a_full_disk_leaves_the_old_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let Some(_disk) = Disk::mount(folder, "16m") else { return };
+    assert_eq!(code(folder, &FIRST), Some(0));
+    let before = fs::read(folder.join("out.vdb")).unwrap();
+    // Room for half as much as is there; each of these takes more.
+    fs::write(folder.join("ballast"), vec![0; (16 << 20) - before.len() * 3 / 2]).unwrap();
+    let run = |words: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_vdb-edit")).args(words).current_dir(folder).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let larger = ["shape", "sphere radius=2", "-o", "out.vdb", "--voxel-size", "0.02"];
+    for words in [
+        &larger[..],
+        &["convert", "out.vdb", "-o", "out.ply"],
+        &["render", "out.vdb", "-o", "out.png", "--size", "2000x2000"],
+    ] {
+        let (code, said) = run(words);
+        assert_eq!(code, Some(4), "{words:?}: {said}");
+        assert!(said.contains("space"), "{words:?}: {said}");
+        assert!(fs::read(folder.join("out.vdb")).unwrap() == before);
+        assert_eq!(fs::read_dir(folder).unwrap().count(), 2, "{words:?}");
+    }
+    fs::remove_file(folder.join("ballast")).unwrap();
+    assert_eq!(code(folder, &larger), Some(0));
+}
+
 #[test]
 fn a_target_that_is_closed_to_writing_or_gone_is_said_before_any_work() {
     let folder = tempfile::tempdir().unwrap();

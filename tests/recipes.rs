@@ -513,3 +513,100 @@ fn the_gallery_holds_what_it_asserts() {
         }
     }
 }
+
+/// Two surfaces, one of which is edited; each is written, the edited one drawn.
+const EDITED: &str = r#"version = 1
+[[step]]
+op = "shape"
+spec = "union(sphere radius=1, box center=1,0,0 size=1,1,1)"
+voxel_size = 0.05
+name = "body"
+[[step]]
+op = "smooth"
+input = "body"
+iterations = 2
+region = ["sphere center=0.6,0.6,0 radius=0.4"]
+name = "smoothed"
+[[step]]
+op = "write"
+input = "body"
+path = "body.vdb"
+[[step]]
+op = "write"
+input = "smoothed"
+path = "smoothed.vdb"
+[[step]]
+op = "render"
+input = "smoothed"
+path = "smoothed.png"
+size = [320, 240]
+"#;
+
+/// Runs a recipe with the results of earlier runs; the operators and names of the steps that ran.
+fn rerun(desk: &Desk, text: &str, results: &mut vdb_edit::recipe::Results) -> Vec<String> {
+    let recipe = vdb_edit::recipe::Recipe::parse(text, &desk.path("r.toml")).unwrap();
+    let run = vdb_edit::run::RunOptions::default();
+    let plans = recipe.plan(&[]).unwrap();
+    let done = plans[0].rerun(results, &run, &mut |_| {}).unwrap();
+    results.forget_unused();
+    let shown = |path: &PathBuf| path.file_name().unwrap().to_str().unwrap().to_owned();
+    let ran = done.steps.into_iter().filter(|step| !step.kept);
+    ran.map(|step| step.output.as_ref().map(shown).or(step.name).unwrap()).collect()
+}
+
+#[test]
+fn only_steps_that_a_change_affects_run_again() {
+    let desk = Desk::new();
+    let results = &mut vdb_edit::recipe::Results::default();
+    let all = ["body", "smoothed", "body.vdb", "smoothed.vdb", "smoothed.png"];
+    let affected = ["smoothed", "smoothed.vdb", "smoothed.png"];
+    let none: [&str; 0] = [];
+    assert_eq!(rerun(&desk, EDITED, results), all);
+    assert_eq!(rerun(&desk, EDITED, results), none);
+    let stamp = std::fs::metadata(desk.path("body.vdb")).unwrap().modified().unwrap();
+    let more = EDITED.replace("iterations = 2", "iterations = 9");
+    assert_eq!(rerun(&desk, &more, results), affected);
+    assert_eq!(std::fs::metadata(desk.path("body.vdb")).unwrap().modified().unwrap(), stamp);
+    // What was written and drawn is what a run from nothing leaves.
+    let fresh = Desk::new();
+    assert_eq!(rerun(&fresh, &more, &mut vdb_edit::recipe::Results::default()), all);
+    let once = Desk::new();
+    once.write("r.toml", &more);
+    once.done(&["run", "r.toml"]);
+    for file in ["body.vdb", "smoothed.vdb", "smoothed.png"] {
+        let [again, fresh, once] = [&desk, &fresh, &once].map(|desk| std::fs::read(desk.path(file)).unwrap());
+        assert!(again == once && fresh == once, "{file}");
+    }
+    // A name says nothing of a result; a file that is gone is written again; what was made before the last run is forgotten.
+    assert_eq!(rerun(&desk, &more.replace("\"smoothed\"", "\"other\""), results), none);
+    std::fs::remove_file(desk.path("body.vdb")).unwrap();
+    assert_eq!(rerun(&desk, &more, results), ["body.vdb"]);
+    assert_eq!(rerun(&desk, EDITED, results), affected);
+    // Files that are read count by what they are on the disk.
+    let of_file = format!(
+        "{}{}",
+        "version = 1\n[[step]]\nop = \"dilate\"\ninput = \"body.vdb\"\ndistance = 0.1\nname = \"d\"\n",
+        "[[step]]\nop = \"write\"\ninput = \"d\"\npath = \"d.vdb\"\n"
+    );
+    assert_eq!(rerun(&desk, &of_file, results), ["d", "d.vdb"]);
+    assert_eq!(rerun(&desk, &of_file, results), none);
+    std::fs::copy(desk.path("smoothed.vdb"), desk.path("body.vdb")).unwrap();
+    assert_eq!(rerun(&desk, &of_file, results), ["d", "d.vdb"]);
+    // A step that fails does not lose what was made before it.
+    let failing = format!("{EDITED}[[step]]\nop = \"assert\"\ninput = \"smoothed\"\ncomponents = 7\n");
+    let recipe = vdb_edit::recipe::Recipe::parse(&failing, &desk.path("r.toml")).unwrap();
+    let run = vdb_edit::run::RunOptions::default();
+    assert!(recipe.plan(&[]).unwrap()[0].rerun(results, &run, &mut |_| {}).is_err());
+    assert_eq!(rerun(&desk, EDITED, results), ["body.vdb", "smoothed.vdb"]);
+}
+
+#[test]
+fn without_room_steps_run_again_with_the_same_result() {
+    let desk = Desk::new();
+    let results = &mut vdb_edit::recipe::Results::within(Some(0));
+    assert_eq!(rerun(&desk, EDITED, results).len(), 5);
+    let before = std::fs::read(desk.path("smoothed.png")).unwrap();
+    // Nothing that has no size is lost: what is written stays.
+    assert_eq!(rerun(&desk, EDITED, results), ["body", "smoothed"]);
+    assert!(std::fs::read(desk.path("smoothed.png")).unwrap() == before);
+}

@@ -3,7 +3,7 @@
 use clap::Command;
 use clap::builder::styling::{AnsiColor, Styles};
 
-use super::{VERBS, args, options};
+use super::{VERBS, args, examples, options};
 use crate::ops::{Arity, Entry, REGISTRY};
 
 const ABOUT: &str = "Edit surfaces stored as narrow-band level sets in OpenVDB files";
@@ -30,7 +30,15 @@ pub fn command() -> Command {
     let verbs = VERBS.iter().map(|verb| (verb.build)(Command::new(verb.name)));
     // Operators with a verb of their own have no second command.
     let own = REGISTRY.iter().filter(|entry| VERBS.iter().all(|verb| verb.name != entry.name));
-    args::running(command).subcommands(verbs).subcommands(own.map(operator))
+    args::running(command).subcommands(verbs.map(with_example)).subcommands(own.map(operator).map(with_example))
+}
+
+/// A subcommand with an example at the end of its help.
+fn with_example(command: Command) -> Command {
+    match examples::command_of(command.get_name()) {
+        Some(example) => command.after_help(format!("Example:\n  {example}")),
+        None => command,
+    }
 }
 
 /// The subcommand of an operator.
@@ -73,6 +81,9 @@ mod tests {
     fn every_command_and_option_has_help() {
         for sub in command().get_subcommands() {
             assert!(sub.get_about().is_some(), "{}", sub.get_name());
+            let example =
+                sub.get_after_help().unwrap_or_else(|| panic!("{} has no example", sub.get_name())).to_string();
+            assert!(example.contains(&format!("vdb-edit {} ", sub.get_name())), "{example}");
             for arg in sub.get_arguments() {
                 assert!(
                     arg.get_help().is_some_and(|h| !h.to_string().is_empty()),

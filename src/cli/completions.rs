@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 
-use clap::{Arg, ArgMatches, Command, value_parser};
+use clap::{Arg, ArgAction, ArgMatches, Command, value_parser};
 use clap_complete::Shell;
 
 use super::context::Context;
-use super::{Verb, app, args, report};
+use super::{Verb, app, args, pages, report};
 use crate::error::{EditError, Result};
 
 /// Shell completions.
@@ -31,13 +31,18 @@ fn build_man(command: Command) -> Command {
     let of = Arg::new("command").value_name("COMMAND").help("Of this command alone");
     let folder =
         args::path("output").long("output").short('o').value_name("FOLDER").help("Write all pages into a folder");
-    command.about("Print a manual page").arg(of.conflicts_with("output")).arg(folder)
+    let markdown = Arg::new("markdown").long("markdown").action(ArgAction::SetTrue).requires("output");
+    let markdown = markdown.help("Pages of the operators in Markdown, as in docs/operators");
+    command.about("Print a manual page").arg(of.conflicts_with("output")).arg(folder).arg(markdown)
 }
 
 fn man(matches: &ArgMatches, _: &Context) -> Result<()> {
     let mut whole = app::command();
     whole.build();
     if let Some(folder) = matches.get_one::<PathBuf>("output") {
+        if args::flag(matches, "markdown") {
+            return pages::write(folder);
+        }
         let made = std::fs::create_dir_all(folder).and_then(|()| clap_mangen::generate_to(whole, folder));
         return made.map_err(|e| EditError::output(folder, e.to_string()));
     }

@@ -4,7 +4,7 @@ use clap::ArgMatches;
 
 use super::args::{IsaChoice, MemoryLimit};
 use super::report::{Format, Reporter};
-use super::size;
+use super::{memory, size};
 use crate::error::{EditError, Result};
 use crate::files::volume;
 use crate::run::RunOptions;
@@ -22,7 +22,7 @@ impl Context {
     /// Sets the process up as the arguments ask: threads, instruction set, logs.
     pub fn new(matches: &ArgMatches, reporter: Reporter) -> Result<Self> {
         let limit = matches.get_one::<MemoryLimit>("memory-limit").map_or_else(size::default_limit, |limit| limit.0);
-        let mut run = RunOptions::default();
+        let mut run = RunOptions::default().with_memory_in_use(memory::resident);
         run.memory_limit = limit;
         if let Some(display) = reporter.display() {
             run = run.with_progress(display);

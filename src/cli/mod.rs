@@ -13,11 +13,14 @@ mod convert;
 #[cfg(feature = "openvdb")]
 mod crosscheck;
 mod edit;
+mod examples;
 mod files;
 mod geodesic;
 mod info;
+mod memory;
 mod morph;
 mod options;
+mod pages;
 mod preview;
 mod progress;
 mod render;
@@ -72,9 +75,10 @@ pub fn main() -> ExitCode {
     let reporter = Reporter::new(matches);
     let result = Context::new(matches, reporter.clone()).and_then(|context| {
         signal::watch(&context.run)?;
+        memory::watch(&context.run, &reporter);
         let result = dispatch(name, matches, &context);
         context.finish();
-        result
+        result.map_err(|error| memory::ended(error, context.run.memory_limit))
     });
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -91,17 +91,27 @@ fn described(arg: Arg, parameter: &Parameter) -> Arg {
         Some((_, unit)) => format!(" [{}]", unit.trim_end_matches(')')),
         None => String::new(),
     };
-    let default = match &parameter.default {
-        Value::Null | Value::Bool(false) => String::new(),
-        Value::Array(list) if list.is_empty() => String::new(),
-        Value::String(text) if text.is_empty() => String::new(),
-        Value::Array(list) => {
-            let list: Vec<String> = list.iter().map(plain).collect();
-            format!(" [default: {}]", list.join(","))
-        }
-        value => format!(" [default: {}]", plain(value)),
-    };
+    let default = default_of(parameter).map(|default| format!(" [default: {default}]")).unwrap_or_default();
     arg.help(format!("{text}{unit}{default}"))
+}
+
+/// The default as it would be typed; none of what is off or empty.
+pub fn default_of(parameter: &Parameter) -> Option<String> {
+    match &parameter.default {
+        Value::Null | Value::Bool(false) => None,
+        Value::Array(list) if list.is_empty() => None,
+        Value::String(text) if text.is_empty() => None,
+        Value::Array(list) => Some(list.iter().map(plain).collect::<Vec<_>>().join(",")),
+        value => Some(plain(value)),
+    }
+}
+
+/// How a parameter is named: by its option, or by its place.
+pub fn written(entry: &Entry, parameter: &Parameter) -> String {
+    match positional(entry, parameter) {
+        Some(place) => format!("{} (`{}`)", place.value_name, parameter.name),
+        None => format!("`--{}`", kebab(&parameter.name)),
+    }
 }
 
 fn plain(value: &Value) -> String {

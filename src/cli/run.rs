@@ -1,7 +1,7 @@
 //! `run`: a recipe, once, for a list of frames, or again whenever its files change. `schema`: what a recipe may hold.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use clap::builder::ValueParser;
 use clap::{Arg, ArgAction, ArgMatches, Command};
@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use super::context::Context;
 use super::{Verb, args, report, size, table};
 use crate::error::{EditError, Result};
-use crate::recipe::{FrameReport, Plan, Recipe, StepReport, parse_frames, schema};
+use crate::recipe::{FrameReport, Plan, Recipe, Results, Stamp, StepReport, parse_frames, schema};
 
 /// The command.
 pub const VERB: Verb = Verb { name: "run", build, run };
@@ -19,7 +19,10 @@ pub const VERB: Verb = Verb { name: "run", build, run };
 pub const SCHEMA: Verb = Verb { name: "schema", build: build_schema, run: print_schema };
 
 /// How often `--watch` looks.
-const POLL: Duration = Duration::from_millis(200);
+const POLL: Duration = Duration::from_millis(20);
+
+/// Part of the memory limit that results may take that are kept for the next run.
+const KEPT: u64 = 2;
 
 fn build(command: Command) -> Command {
     command
@@ -56,7 +59,10 @@ fn build(command: Command) -> Command {
                 .long("watch")
                 .action(ArgAction::SetTrue)
                 .conflicts_with_all(["json", "dry-run"])
-                .help("Run again whenever the recipe or one of its input files changes, until cancelled"),
+                .help(
+                    "Run again whenever the recipe or one of its input files changes, until cancelled: only the steps that the change affects; \
+                     pictures appear first, in a quarter of their resolution before the whole",
+                ),
         )
         .arg(
             args::path("output")
@@ -107,15 +113,16 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         context,
     };
     if !args::flag(matches, "watch") {
-        return job.once(&mut Vec::new());
+        return job.once(&mut Vec::new(), None);
     }
+    let mut results = Results::within(context.run.memory_limit.map(|limit| limit / KEPT));
     loop {
         let mut watched = vec![job.path.clone()];
         let before = stamps(&watched);
-        match job.once(&mut watched) {
+        match job.once(&mut watched, Some(&mut results)) {
             Err(error @ EditError::Cancelled { .. }) => return Err(error),
             Err(error) => context.reporter.error(&error, error.exit_code()),
-            Ok(()) => {}
+            Ok(()) => results.forget_unused(),
         }
         context.reporter.text(|| format!("watching {} and what it reads\n", job.path.display()));
         // The recipe may have changed while it ran; of its inputs this would be seen at the next change only.
@@ -137,13 +144,8 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     }
 }
 
-/// When files were changed last, and their sizes.
-fn stamps(paths: &[PathBuf]) -> Vec<Option<(SystemTime, u64)>> {
-    let stamp = |path: &PathBuf| {
-        let facts = std::fs::metadata(path).ok()?;
-        Some((facts.modified().ok()?, facts.len()))
-    };
-    paths.iter().map(stamp).collect()
+fn stamps(paths: &[PathBuf]) -> Vec<Stamp> {
+    paths.iter().map(|path| Stamp::of(path)).collect()
 }
 
 /// What is to be run.
@@ -159,8 +161,8 @@ struct Job<'a> {
 }
 
 impl Job<'_> {
-    /// Runs all frames; the files that they read go to `watched`.
-    fn once(&self, watched: &mut Vec<PathBuf>) -> Result<()> {
+    /// Runs all frames, of their steps only those whose results are not kept; the files that they read go to `watched`.
+    fn once(&self, watched: &mut Vec<PathBuf>, mut results: Option<&mut Results>) -> Result<()> {
         let began = Instant::now();
         let mut recipe = Recipe::read(&self.path)?;
         if let Some(folder) = &self.output_folder {
@@ -194,7 +196,10 @@ impl Job<'_> {
                     reporter.warn(warning);
                     warnings.push(warning.to_owned());
                 };
-                let done = plan.run(&self.context.run, &mut warn)?;
+                let done = match results.as_deref_mut() {
+                    Some(results) => plan.rerun(results, &self.context.run, &mut warn)?,
+                    None => plan.run(&self.context.run, &mut warn)?,
+                };
                 reporter.text(|| text(&self.path, &done, several));
                 let mut value = serde_json::to_value(&done).unwrap_or(Value::Null);
                 if let Some(value) = value.as_object_mut() {
@@ -250,17 +255,24 @@ fn line_of(step: &Value) -> String {
 fn text(recipe: &Path, done: &FrameReport, several: bool) -> String {
     let frame = if several { format!(", frame {}", done.frame) } else { String::new() };
     let rows = done.steps.iter().map(|step| {
-        let StepReport { op, name, seconds, active_voxels, summary, .. } = step;
+        let StepReport { op, name, seconds, kept, active_voxels, summary, .. } = step;
         let made = active_voxels.map(|n| format!("{} voxels", table::count(n)));
         let bytes = summary.details.get("bytes").and_then(Value::as_u64).map(size::shown);
+        let pixels = summary.details.get("pixels_drawn").and_then(Value::as_u64).map(table::count);
+        let pixels = || pixels.map(|count| format!("{count} pixels"));
         vec![
             (*op).to_owned(),
             name.clone().unwrap_or_default(),
-            format!("{seconds:.2} s"),
-            made.or(bytes).unwrap_or_default(),
+            if *kept { "kept".into() } else { format!("{seconds:.2} s") },
+            made.or(bytes).or_else(pixels).unwrap_or_default(),
         ]
     });
-    let mut text = format!("{}{frame}: {} steps in {:.2} s\n", recipe.display(), done.steps.len(), done.seconds);
+    let mut text = format!(
+        "{}{frame}: {} steps in {:.2} s\n",
+        recipe.display(),
+        done.steps.iter().filter(|step| !step.kept).count(),
+        done.seconds
+    );
     text += &table::columns(rows);
     for path in &done.outputs {
         text += &format!("  wrote {}\n", path.display());

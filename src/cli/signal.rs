@@ -14,7 +14,7 @@ use crate::error::{EditError, Result};
 use crate::run::RunOptions;
 
 /// How long a cancelled run may take to end by itself. Users and farms are promised a second.
-const GRACE: Duration = Duration::from_millis(800);
+pub const GRACE: Duration = Duration::from_millis(800);
 
 /// The first signal that came; 0 before.
 static FIRST: AtomicI32 = AtomicI32::new(0);
@@ -40,7 +40,7 @@ pub fn watch(run: &RunOptions) -> Result<()> {
     let work = move || {
         for signal in signals.forever() {
             if FIRST.compare_exchange(0, signal, Ordering::Relaxed, Ordering::Relaxed).is_err() {
-                leave(signal);
+                leave(code_of(signal));
             }
             cancel.store(true, Ordering::Relaxed);
             give_up_later(signal);
@@ -52,14 +52,14 @@ pub fn watch(run: &RunOptions) -> Result<()> {
 fn give_up_later(signal: i32) {
     let wait = move || {
         std::thread::sleep(GRACE);
-        leave(signal);
+        leave(code_of(signal));
     };
     // Without a thread the run still ends by the cancel flag.
     let _ = std::thread::Builder::new().name("grace".into()).spawn(wait);
 }
 
-/// Ends the process without running destructors, which must not run while other threads work.
-fn leave(signal: i32) -> ! {
+/// Ends the process with an exit code, without running destructors, which must not run while other threads work.
+pub fn leave(code: u8) -> ! {
     atomic::remove_unfinished();
-    signal_hook::low_level::exit(i32::from(code_of(signal)))
+    signal_hook::low_level::exit(i32::from(code))
 }

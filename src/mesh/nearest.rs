@@ -94,7 +94,7 @@ pub(super) fn leaves_of_band(
         wanted(first, last)
     });
     let task = run.task("distances", tiles.len() as u64);
-    let made = AtomicU64::new(0);
+    let (before, made) = (run.memory_in_use(), AtomicU64::new(0));
     tiles
         .par_iter()
         .map_init(Scratch::default, |scratch, &tile| {
@@ -102,10 +102,11 @@ pub(super) fn leaves_of_band(
             let mut leaves = Vec::new();
             let triangles = search.collect(tile, scratch);
             // Neither the triangles of a tile nor all leaves so far may need more than there is.
-            run.reserve(operation, triangles * Clusters::BYTES_A_TRIANGLE, "take a smaller distance")?;
+            run.reserve_since(before, operation, triangles * Clusters::BYTES_A_TRIANGLE, "take a smaller distance")?;
             search.tile(tile, scratch, &mut leaves);
             let made = made.fetch_add(leaves.len() as u64, Ordering::Relaxed) + leaves.len() as u64;
-            run.reserve(operation, made * BYTES_A_LEAF, "take a narrower band, a smaller distance or larger voxels")?;
+            let advice = "take a narrower band, a smaller distance or larger voxels";
+            run.reserve_since(before, operation, made * BYTES_A_LEAF, advice)?;
             task.advance(1);
             Ok(leaves)
         })

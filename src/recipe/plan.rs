@@ -32,7 +32,13 @@ pub(super) struct Planned {
     pub place: String,
     pub inputs: Vec<Given>,
     pub action: Action,
-    values: Map<String, Value>,
+    /// The files that its parameters and regions name.
+    pub reads: Vec<PathBuf>,
+    /// The files that it writes beside its result.
+    pub writes: Vec<PathBuf>,
+    /// The steps that write files it reads.
+    pub after: Vec<usize>,
+    pub values: Map<String, Value>,
 }
 
 impl Planned {
@@ -87,7 +93,8 @@ impl Recipe {
     fn plan_frame(&self, frame: i64) -> Result<Plan<'_>> {
         let mut plan = Plan { recipe: self, steps: Vec::new(), frame, files: Vec::new(), outputs: Vec::new() };
         for step in &self.steps {
-            let planned = Planner { recipe: self, step, frame, plan: &mut plan }.step()?;
+            let mut planner = Planner { recipe: self, step, frame, plan: &mut plan, after: Vec::new() };
+            let planned = planner.step()?;
             plan.outputs.extend(planned.output());
             plan.steps.push(planned);
         }
@@ -132,7 +139,7 @@ impl Plan<'_> {
 }
 
 impl Planned {
-    fn output(&self) -> Option<PathBuf> {
+    pub fn output(&self) -> Option<PathBuf> {
         match &self.action {
             Action::Write(target) => Some(target.path.clone().into()),
             Action::Render(picture) => Some(picture.path.clone().into()),
@@ -147,16 +154,21 @@ struct Planner<'a, 'p> {
     step: &'a Step,
     frame: i64,
     plan: &'p mut Plan<'a>,
+    /// The steps that write files it reads.
+    after: Vec<usize>,
 }
 
 impl Planner<'_, '_> {
-    fn step(mut self) -> Result<Planned> {
+    fn step(&mut self) -> Result<Planned> {
         let step = self.step;
+        let (files, outputs) = (self.plan.files.len(), self.plan.outputs.len());
         let place = self.recipe.place(step.line, step);
         let mut values = Map::new();
         for key in &step.keys {
             self.value(key, &mut values)?;
         }
+        let reads = self.plan.files[files..].to_vec();
+        let writes = self.plan.outputs[outputs..].to_vec();
         let action = self.action(values.clone()).map_err(|error| self.blamed(error))?;
         let inputs = step.inputs.iter().map(|source| self.input(source)).collect::<Result<Vec<_>>>()?;
         let files = inputs.iter().filter_map(|given| match given {
@@ -166,7 +178,8 @@ impl Planner<'_, '_> {
         let files: Vec<PathBuf> = files.collect();
         self.probe(&files, &action).map_err(|error| error.at(&place))?;
         self.plan.files.extend(files);
-        Ok(Planned { place, inputs, action, values })
+        let after = std::mem::take(&mut self.after);
+        Ok(Planned { place, inputs, action, reads, writes, after, values })
     }
 
     /// The place of a key.
@@ -231,10 +244,12 @@ impl Planner<'_, '_> {
             numbered(&path, self.frame).unwrap_or(path)
         };
         let mut path = in_folder(output_folder);
+        let writes = |planned: &Planned| planned.writes.contains(&path) || planned.output().as_ref() == Some(&path);
         if by_operator {
             self.plan.outputs.push(path.clone());
-        } else if !is_output && !self.plan.outputs.contains(&path) {
-            // Not what an earlier step writes.
+        } else if !is_output && let Some(step) = self.plan.steps.iter().position(writes) {
+            self.after.push(step);
+        } else if !is_output {
             path = in_folder(self.recipe.folder());
             readable(&path).map_err(|error| error.at(place))?;
             self.plan.files.push(path.clone());

@@ -10,7 +10,7 @@ use serde_json::{Map, Value};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::ops::{RegionSpecs, Vector, parse, words};
-use crate::render::{CameraSpec, ColorBy, Frame, Image, Patches, RenderOptions, UpAxis, render};
+use crate::render::{CameraSpec, ColorBy, Frame, Image, Patches, Redraw, RenderOptions, UpAxis, render};
 use crate::run::RunOptions;
 
 /// Pictures beside each other.
@@ -180,6 +180,33 @@ impl Picture {
 
     /// Draws the inputs.
     pub fn draw(&self, inputs: &[LevelSet], run: &RunOptions) -> Result<Image> {
+        self.draw_each(inputs, run, |_, level_set, color_by, options| render(level_set, color_by, options, run))
+    }
+
+    /// As [`draw`](Self::draw), what has not changed since the last time taken from the last pictures; `coarse` is given a coarse picture
+    /// before, if there is one input and anything to be drawn.
+    pub fn draw_again(
+        &self,
+        inputs: &[LevelSet],
+        last: &mut Vec<Redraw>,
+        coarse: &mut dyn FnMut(&Image) -> Result<()>,
+        run: &RunOptions,
+    ) -> Result<Image> {
+        last.resize_with(inputs.len(), Redraw::default);
+        let is_one = inputs.len() == 1;
+        let mut coarse = |image: &Image| if is_one { coarse(image) } else { Ok(()) };
+        self.draw_each(inputs, run, |n, level_set, color_by, options| match last.get_mut(n) {
+            Some(last) => last.render(level_set, color_by, options, &mut coarse, run),
+            None => render(level_set, color_by, options, run),
+        })
+    }
+
+    fn draw_each(
+        &self,
+        inputs: &[LevelSet],
+        run: &RunOptions,
+        mut draw: impl FnMut(usize, &LevelSet, &ColorBy<'_>, &RenderOptions) -> Result<Image>,
+    ) -> Result<Image> {
         let mut options = self.options();
         let first = matches!(self.color_by, Color::Difference | Color::Geodesic);
         let drawn = if first { &inputs[..1.min(inputs.len())] } else { inputs };
@@ -189,17 +216,22 @@ impl Picture {
                 options.camera.frame = Frame::Box(lo, hi);
             }
         }
-        let draw = |level_set: &LevelSet| self.draw_one(level_set, inputs.get(1), &options, run);
-        Ok(Image::side_by_side(&drawn.iter().map(draw).collect::<Result<Vec<_>>>()?))
+        let mut images = Vec::new();
+        for (n, level_set) in drawn.iter().enumerate() {
+            let draw = |color_by: &ColorBy<'_>| draw(n, level_set, color_by, &options);
+            images.push(self.colored(level_set, inputs.get(1), run, draw)?);
+        }
+        Ok(Image::side_by_side(&images))
     }
 
-    fn draw_one(
+    /// Has something drawn with the colours of an input.
+    fn colored<T>(
         &self,
         level_set: &LevelSet,
         other: Option<&LevelSet>,
-        options: &RenderOptions,
         run: &RunOptions,
-    ) -> Result<Image> {
+        draw: impl FnOnce(&ColorBy<'_>) -> Result<T>,
+    ) -> Result<T> {
         let region = self.region.on(level_set, run)?;
         let components = match self.color_by {
             Color::Component => Some(level_set.components(run)?),
@@ -232,6 +264,6 @@ impl Picture {
             (Color::Distortion, ..) => patches.as_ref().map_or(ColorBy::Clay, ColorBy::Distortion),
             _ => ColorBy::Clay,
         };
-        render(level_set, &color_by, options, run)
+        draw(&color_by)
     }
 }

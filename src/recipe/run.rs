@@ -8,6 +8,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::plan::{Action, Given, Plan, Planned};
+use super::results::{Identity, Key, Results, Stamp};
 use super::step::Conversion;
 use crate::atomic::{Staging, write_atomically};
 use crate::error::{EditError, Result};
@@ -17,6 +18,7 @@ use crate::files::volume::Volume;
 use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
 use crate::mesh::{Rebuild, rebuild};
 use crate::ops::{Outcome, Summary, VoxelLength, WorldLength};
+use crate::render::{Image, Redraw};
 use crate::run::RunOptions;
 use crate::scan::Inside;
 
@@ -31,6 +33,9 @@ pub struct StepReport {
     pub line: usize,
     /// How long it took.
     pub seconds: f64,
+    /// Whether it did not run, since its result was there.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub kept: bool,
     /// Active voxels of its result.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub active_voxels: Option<u64>,
@@ -57,8 +62,8 @@ pub struct FrameReport {
 
 /// A result that is still needed.
 #[derive(Clone)]
-struct Slot {
-    level_set: LevelSet,
+pub(super) struct Slot {
+    pub level_set: LevelSet,
     /// The file that a `.vdb` made of it carries over, and the grid whose place it takes.
     source: Option<Rc<(Volume, Option<usize>)>>,
     /// What meshes that went into it carried, which a level set does not.
@@ -75,46 +80,135 @@ struct Running<'a> {
     staging: Staging,
     /// Whether what is written is verified first.
     check: bool,
+    /// What earlier runs have made.
+    results: Option<&'a mut Results>,
     run: &'a RunOptions,
 }
 
 impl Plan<'_> {
     /// Computes all steps, then lets the files appear. `warn` is told what the user should know as soon as it is known.
     pub fn run(&self, run: &RunOptions, warn: &mut dyn FnMut(&str)) -> Result<FrameReport> {
+        self.run_steps(None, run, warn)
+    }
+
+    /// As [`run`](Self::run), but only of steps whose results are not in `results`, to which they are added. Pictures are drawn first
+    /// and appear at once, coarse ones before them; other files appear when all steps have succeeded.
+    pub fn rerun(&self, results: &mut Results, run: &RunOptions, warn: &mut dyn FnMut(&str)) -> Result<FrameReport> {
+        self.run_steps(Some(results), run, warn)
+    }
+
+    fn run_steps(
+        &self,
+        mut results: Option<&mut Results>,
+        run: &RunOptions,
+        warn: &mut dyn FnMut(&str),
+    ) -> Result<FrameReport> {
         let began = Instant::now();
-        let uses = self.recipe.steps.iter().map(|step| step.uses).collect();
+        let steps = &self.recipe.steps;
+        let (mut reports, mut slots) = (vec![None; steps.len()], vec![None; steps.len()]);
+        let mut order: Vec<usize> = (0..steps.len()).collect();
+        let mut known = Vec::new();
+        if let Some(results) = results.as_deref_mut() {
+            order.sort_by_key(|&n| matches!(self.steps[n].action, Action::Write(_)));
+            known = self.identities(results);
+            self.take_kept(results, &known, &mut slots, &mut reports);
+        }
+        let uses = steps.iter().map(|step| step.uses).collect();
         let check = self.recipe.check;
-        let mut running = Running { slots: Vec::new(), uses, staging: Staging::default(), check, run };
-        let mut reports = Vec::new();
-        for (step, planned) in self.recipe.steps.iter().zip(&self.steps) {
+        let mut running = Running { slots, uses, staging: Staging::default(), check, results, run };
+        let mut written = Vec::new();
+        for n in order {
+            let (step, planned) = (&steps[n], &self.steps[n]);
             run.check("run")?;
+            if reports[n].is_some() {
+                continue;
+            }
             let began = Instant::now();
             let (slot, summary) = running.step(planned).map_err(|error| error.at(&planned.place))?;
             summary.warnings.iter().for_each(|warning| warn(&format!("{}: {warning}", planned.place)));
-            let output = match &planned.action {
-                Action::Write(target) => Some(target.path.clone().into()),
-                Action::Render(picture) => Some(picture.path.clone().into()),
-                _ => None,
-            };
-            reports.push(StepReport {
+            let report = StepReport {
                 op: step.op.name(),
                 name: step.name.clone(),
                 line: step.line,
                 seconds: began.elapsed().as_secs_f64(),
+                kept: false,
                 active_voxels: slot.as_ref().map(|slot| slot.level_set.grid().active_voxels()),
-                output,
+                output: planned.output(),
                 summary,
-            });
-            running.slots.push(slot);
+            };
+            match &planned.action {
+                Action::Write(_) => written.push(n),
+                _ => running.keep(planned, known.get(n), slot.as_ref(), &report),
+            }
+            running.slots[n] = slot;
+            reports[n] = Some(report);
         }
         run.check("run")?;
-        running.staging.commit()?;
+        std::mem::take(&mut running.staging).commit()?;
+        for n in written {
+            // What it wrote is there only now.
+            if let Some(report) = &reports[n] {
+                running.keep(&self.steps[n], known.get(n), None, report);
+            }
+        }
         let seconds = began.elapsed().as_secs_f64();
-        Ok(FrameReport { frame: self.frame(), seconds, steps: reports, outputs: self.outputs().to_vec() })
+        let steps = reports.into_iter().flatten().collect();
+        Ok(FrameReport { frame: self.frame(), seconds, steps, outputs: self.outputs().to_vec() })
+    }
+
+    /// What stands for each step.
+    fn identities(&self, results: &mut Results) -> Vec<Identity> {
+        let mut known: Vec<Identity> = Vec::new();
+        for (step, planned) in self.recipe.steps.iter().zip(&self.steps) {
+            let (mut steps, mut files) = (Vec::new(), Vec::new());
+            let mut file = |path: &PathBuf| files.push((path.clone(), Stamp::of(path)));
+            for given in &planned.inputs {
+                match given {
+                    Given::Step(index) => steps.push(known[*index]),
+                    // Its place among the inputs is part of what is asked.
+                    Given::File(path) => {
+                        steps.push(0);
+                        file(path);
+                    }
+                }
+            }
+            steps.extend(planned.after.iter().map(|index| known[*index]));
+            planned.reads.iter().for_each(file);
+            let what = format!("{} {} {}", step.op.name(), Value::from(planned.values.clone()), self.recipe.check);
+            known.push(results.identity(Key { what, steps, files }));
+        }
+        known
+    }
+
+    /// Takes what need not run.
+    fn take_kept(
+        &self,
+        results: &mut Results,
+        known: &[Identity],
+        slots: &mut [Option<Slot>],
+        reports: &mut [Option<StepReport>],
+    ) {
+        for (n, planned) in self.steps.iter().enumerate() {
+            if let Some(made) = results.get(known[n]) {
+                slots[n] = made.slot.clone();
+                reports[n] = Some(StepReport { kept: true, seconds: 0.0, ..made.report.clone() });
+            }
+            if let Action::Render(picture) = &planned.action {
+                results.keep_pictures(Path::new(&picture.path));
+            }
+        }
     }
 }
 
 impl Running<'_> {
+    /// Adds what a step has made to the results.
+    fn keep(&mut self, planned: &Planned, known: Option<&Identity>, slot: Option<&Slot>, report: &StepReport) {
+        if let (Some(results), Some(known)) = (self.results.as_deref_mut(), known) {
+            let files: Vec<PathBuf> = planned.writes.iter().cloned().chain(planned.output()).collect();
+            results.keep(*known, slot, report, &files);
+        }
+    }
+
     fn step(&mut self, planned: &Planned) -> Result<(Option<Slot>, Summary)> {
         let mut warnings = Vec::new();
         let (result, mut summary) = match &planned.action {
@@ -166,12 +260,33 @@ impl Running<'_> {
             Action::Render(picture) => {
                 let inputs = self.take(planned, false, &mut warnings)?;
                 let level_sets: Vec<LevelSet> = inputs.into_iter().map(|slot| slot.level_set).collect();
-                let image = picture.draw(&level_sets, self.run)?;
-                let place = self.staging.place(Path::new(&picture.path))?;
-                write_atomically(&place, |out| image.write_png(out))?;
+                let path = Path::new(&picture.path);
+                let write = |path: &Path, image: &Image| write_atomically(path, |out| image.write_png(out));
+                let mut drawn = None;
+                let image = match &mut self.results {
+                    None => {
+                        let image = picture.draw(&level_sets, self.run)?;
+                        write(&self.staging.place(path)?, &image)?;
+                        image
+                    }
+                    Some(results) => {
+                        let draw = |last: &mut Vec<Redraw>| {
+                            let coarse = &mut |image: &Image| write(path, image);
+                            let image = picture.draw_again(&level_sets, last, coarse, self.run)?;
+                            drawn = Some(last.iter().map(Redraw::drawn).sum::<usize>());
+                            Ok::<_, EditError>(image)
+                        };
+                        let image = results.with_pictures(path, draw)?;
+                        write(path, &image)?;
+                        image
+                    }
+                };
                 let mut summary = Summary::default();
                 summary.details.insert("width".into(), Value::from(image.width));
                 summary.details.insert("height".into(), Value::from(image.height));
+                if let Some(drawn) = drawn {
+                    summary.details.insert("pixels_drawn".into(), json!(drawn));
+                }
                 (None, summary)
             }
         };

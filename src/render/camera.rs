@@ -59,6 +59,7 @@ impl Default for CameraSpec {
 }
 
 /// A placed camera, in world space.
+#[derive(Clone, PartialEq)]
 pub(super) struct Camera {
     pub eye: DVec3,
     pub right: DVec3,

@@ -46,6 +46,12 @@ impl Ray {
         Self { origin: self.at(t), ..*self }
     }
 
+    /// Whether the ray passes through a box before `t_end`.
+    pub fn meets(&self, bounds: (DVec3, DVec3), t_end: f64) -> bool {
+        let (enter, leave) = self.crossing(bounds);
+        enter <= leave && leave >= 0.0 && enter <= t_end
+    }
+
     /// Entry and exit of a box.
     #[inline(always)]
     fn crossing(&self, (lo, hi): (DVec3, DVec3)) -> (f64, f64) {

@@ -11,6 +11,7 @@ mod march;
 mod occlusion;
 mod patches;
 mod png;
+mod redraw;
 mod screen;
 mod shade;
 mod skip;
@@ -25,6 +26,7 @@ pub use camera::{CameraSpec, Frame, UpAxis};
 pub(crate) use patches::PROPERTIES;
 pub use patches::Patches;
 pub use png::Image;
+pub use redraw::Redraw;
 pub use vertices::{distance_colors, vertex_colors};
 
 use crate::error::{EditError, Result};
@@ -38,7 +40,7 @@ use occlusion::Light;
 use screen::Screen;
 use shade::Lights;
 use skip::SkipMap;
-use tile::{Picture, TILE};
+use tile::Picture;
 
 /// Largest width and height of a picture.
 pub const MAX_SIZE: u32 = 16384;
@@ -177,6 +179,29 @@ pub fn render(
     options: &RenderOptions,
     run: &RunOptions,
 ) -> Result<Image> {
+    let picture = prepare(level_set, color_by, options, run)?;
+    let corners = picture.corners();
+    let task = run.task(OPERATION, corners.len() as u64);
+    let draw = |corner: &(u32, u32)| {
+        if run.is_cancelled() {
+            return Vec::new();
+        }
+        let tile = picture.tile(*corner, None).rgba8;
+        task.advance(1);
+        tile
+    };
+    let tiles: Vec<Vec<u8>> = corners.par_iter().map(draw).collect();
+    run.check(OPERATION)?;
+    Ok(picture.assembled(tiles.iter()))
+}
+
+/// All that a picture's tiles need to be drawn.
+fn prepare<'a>(
+    level_set: &'a LevelSet,
+    color_by: &'a ColorBy<'a>,
+    options: &RenderOptions,
+    run: &RunOptions,
+) -> Result<Picture<'a>> {
     options.validate()?;
     run.check(OPERATION)?;
     let &RenderOptions { width, height, .. } = options;
@@ -205,7 +230,7 @@ pub fn render(
         _ => CURVATURE_RANGE,
     };
     let range = options.range.unwrap_or(default_range);
-    let picture = Picture {
+    Ok(Picture {
         screen: skip.as_ref().map(|skip| Screen::new(skip, &camera, &transform, width, height)),
         scene: skip.map(|skip| Scene { field: Field::new(level_set.grid(), level_set.voxel_size()), skip }),
         camera,
@@ -219,38 +244,7 @@ pub fn render(
         width,
         height,
         background: (!options.transparent_background).then(|| options.background.map(shade::decode)),
-    };
-
-    let corners: Vec<(u32, u32)> = (0..height)
-        .step_by(TILE as usize)
-        .flat_map(|y| (0..width).step_by(TILE as usize).map(move |x| (x, y)))
-        .collect();
-    let task = run.task(OPERATION, corners.len() as u64);
-    let tiles: Vec<Vec<u8>> = corners
-        .par_iter()
-        .map(|&(x, y)| {
-            if run.is_cancelled() {
-                return Vec::new();
-            }
-            let tile = picture.tile(x, y);
-            task.advance(1);
-            tile
-        })
-        .collect();
-    run.check(OPERATION)?;
-    let mut rgba8 = vec![0; pixels as usize * 4];
-    for (&(x, y), tile) in corners.iter().zip(&tiles) {
-        let row_bytes = TILE.min(width - x) as usize * 4;
-        for (row, bytes) in (y as usize..).zip(tile.chunks_exact(row_bytes)) {
-            let at = (row * width as usize + x as usize) * 4;
-            rgba8[at..at + row_bytes].copy_from_slice(bytes);
-        }
-    }
-    let mut image = Image { width, height, rgba8 };
-    if matches!(color_by, ColorBy::Distortion(_)) {
-        legend::draw(&mut image, 1.0, 1.0 + range);
-    }
-    Ok(image)
+    })
 }
 
 #[cfg(test)]

@@ -49,18 +49,14 @@ pub(super) fn visibility(
     (x, y): (i64, i64),
 ) -> Visibility {
     let origin = point + normal * LIFT;
-    let [column, row] = [x, y].map(|c| c.rem_euclid(PATTERN as i64) as usize);
-    let class = row * PATTERN + column;
+    let class = class_of((x, y));
     let (tangent, bitangent) = normal.any_orthonormal_pair();
     let sky = if light.sky_rays == 0 {
         1.0
     } else {
         let mut seen = 0.0;
         for k in 0..light.sky_rays {
-            let [u, v] = set_point(k, light.sky_rays, class);
-            let (sin, cos) = (std::f64::consts::TAU * v).sin_cos();
-            let direction = (tangent * cos + bitangent * sin) * u.sqrt() + normal * (1.0 - u).sqrt();
-            let ray = Ray::new(origin, direction);
+            let ray = light.to_sky((origin, normal), (tangent, bitangent), k, class);
             // A near obstacle hides the sky, a far one reflects light itself.
             seen += scene.hit(cursor, &ray, Start::Surface, light.range).map_or(1.0, |t| (t / light.range).powi(2));
         }
@@ -71,18 +67,47 @@ pub(super) fn visibility(
     } else if normal.dot(light.key) < -LIGHT_RADIUS {
         0.0
     } else {
-        let (a, b) = light.key.any_orthonormal_pair();
+        let pair = light.key.any_orthonormal_pair();
         let mut seen = 0;
         for k in 0..light.key_rays {
-            let [u, v] = set_point(k, light.key_rays, class);
-            let (sin, cos) = (std::f64::consts::TAU * v).sin_cos();
-            let direction = (light.key + (a * cos + b * sin) * (u.sqrt() * LIGHT_RADIUS)).normalize();
-            seen +=
-                usize::from(scene.hit(cursor, &Ray::new(origin, direction), Start::Surface, f64::INFINITY).is_none());
+            let ray = light.to_key(origin, pair, k, class);
+            seen += usize::from(scene.hit(cursor, &ray, Start::Surface, f64::INFINITY).is_none());
         }
         seen as f64 / light.key_rays as f64
     };
     Visibility { sky, key }
+}
+
+/// Whether one of the rays of [`visibility`] passes through a box.
+pub(super) fn meets(light: &Light, (point, normal): (DVec3, DVec3), at: (i64, i64), bounds: (DVec3, DVec3)) -> bool {
+    let (origin, class) = (point + normal * LIFT, class_of(at));
+    let pair = normal.any_orthonormal_pair();
+    let to_sky = |k| light.to_sky((origin, normal), pair, k, class).meets(bounds, light.range);
+    let pair = light.key.any_orthonormal_pair();
+    let to_key = |k| light.to_key(origin, pair, k, class).meets(bounds, f64::INFINITY);
+    (0..light.sky_rays).any(to_sky) || (0..light.key_rays).any(to_key)
+}
+
+/// The place of a pixel in the pattern.
+fn class_of((x, y): (i64, i64)) -> usize {
+    let [column, row] = [x, y].map(|c| c.rem_euclid(PATTERN as i64) as usize);
+    row * PATTERN + column
+}
+
+impl Light {
+    /// A ray to the sky above a point with its normal and the directions across that.
+    fn to_sky(&self, (origin, normal): (DVec3, DVec3), (a, b): (DVec3, DVec3), k: usize, class: usize) -> Ray {
+        let [u, v] = set_point(k, self.sky_rays, class);
+        let (sin, cos) = (std::f64::consts::TAU * v).sin_cos();
+        Ray::new(origin, (a * cos + b * sin) * u.sqrt() + normal * (1.0 - u).sqrt())
+    }
+
+    /// A ray to the key light, whose disc two directions span.
+    fn to_key(&self, origin: DVec3, (a, b): (DVec3, DVec3), k: usize, class: usize) -> Ray {
+        let [u, v] = set_point(k, self.key_rays, class);
+        let (sin, cos) = (std::f64::consts::TAU * v).sin_cos();
+        Ray::new(origin, (self.key + (a * cos + b * sin) * (u.sqrt() * LIGHT_RADIUS)).normalize())
+    }
 }
 
 /// Point `k` of `count` in the unit square, for one class of the pattern: any run of the R2 sequence is even over the
@@ -92,7 +117,7 @@ fn set_point(k: usize, count: usize, class: usize) -> [f64; 2] {
 }
 
 /// A pixel as the filter sees it.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq)]
 pub(super) struct FilterPoint {
     pub position: DVec3,
     pub normal: DVec3,

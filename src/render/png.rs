@@ -52,6 +52,13 @@ impl Image {
         Self { width, height, rgba8 }
     }
 
+    /// Every pixel as a square of pixels with an edge of `factor`, cut to a size.
+    pub fn enlarged(&self, factor: u32, width: u32, height: u32) -> Self {
+        let at = |x: u32, y: u32| self.pixel(x / factor.max(1), y / factor.max(1)).unwrap_or_default();
+        let rgba8 = (0..height).flat_map(|y| (0..width).flat_map(move |x| at(x, y))).collect();
+        Self { width, height, rgba8 }
+    }
+
     /// Writes the picture as PNG, marked as sRGB; without an alpha channel where every pixel is opaque.
     pub fn write_png(&self, to: impl Write) -> io::Result<()> {
         let opaque = self.rgba8.chunks_exact(4).all(|p| p[3] == u8::MAX);

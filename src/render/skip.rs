@@ -86,13 +86,7 @@ impl SkipMap {
 
     /// The boxes of the blocks that may hold surface, in index space.
     pub fn blocks(&self) -> impl Iterator<Item = (DVec3, DVec3)> + '_ {
-        let edge = f64::from(1u32 << self.shift);
-        let row = self.size.z;
-        self.distance.iter().enumerate().filter(|(_, distance)| **distance == 0).map(move |(n, _)| {
-            let n = n as i32;
-            let lo = (self.lo + IVec3::new(n / (self.size.y * row), n / row % self.size.y, n % row)).as_dvec3() * edge;
-            (lo, lo + edge)
-        })
+        (0..self.distance.len()).filter(|n| self.distance[*n] == 0).map(|n| self.block_at(n))
     }
 
     /// The block of a cell.
@@ -104,13 +98,30 @@ impl SkipMap {
     /// The box around a block that holds no surface, in index space: `None` if the block itself may hold some.
     #[inline(always)]
     pub fn empty_around(&self, block: IVec3) -> Option<(DVec3, DVec3)> {
-        let local = (block - self.lo).clamp(IVec3::ZERO, self.size - 1);
-        let distance = i32::from(self.distance[self.index(local)]);
+        let distance = i32::from(self.distance[self.index((block - self.lo).clamp(IVec3::ZERO, self.size - 1))]);
         if distance == 0 {
             return None;
         }
         let edge = f64::from(1u32 << self.shift);
         Some(((block - (distance - 1)).as_dvec3() * edge, (block + distance).as_dvec3() * edge))
+    }
+
+    /// Whether both maps have the same blocks.
+    pub fn is_congruent(&self, other: &Self) -> bool {
+        (self.lo, self.size, self.shift) == (other.lo, other.size, other.shift)
+    }
+
+    /// The boxes of the blocks that hold surface in one of two maps with the same blocks, and not in the other.
+    pub fn changed<'a>(&'a self, before: &'a Self) -> impl Iterator<Item = (DVec3, DVec3)> + 'a {
+        let changed = move |n: &usize| (self.distance[*n] == 0) != (before.distance[*n] == 0);
+        (0..self.distance.len()).filter(changed).map(|n| self.block_at(n))
+    }
+
+    /// The box of a block by its place.
+    fn block_at(&self, n: usize) -> (DVec3, DVec3) {
+        let (n, row, edge) = (n as i32, self.size.z, f64::from(1u32 << self.shift));
+        let lo = (self.lo + IVec3::new(n / (self.size.y * row), n / row % self.size.y, n % row)).as_dvec3() * edge;
+        (lo, lo + edge)
     }
 
     /// Bytes of the map.

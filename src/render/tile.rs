@@ -9,10 +9,11 @@ use super::camera::Camera;
 use super::field::Cursor;
 use super::march::{Ray, Scene, Start};
 use super::occlusion::{self, FilterPoint, Light, REACH, Visibility, filter_weight};
+use super::png::Image;
 use super::screen::Screen;
 use super::shade::{self, Lights};
 use super::vertices::sequential;
-use super::{ColorBy, DataRange};
+use super::{ColorBy, DataRange, legend};
 use crate::grid::{Accessor, Transform};
 use crate::levelset::Sampler;
 
@@ -44,7 +45,7 @@ pub(super) struct Picture<'a> {
 }
 
 /// A surface point that a ray met.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq)]
 struct Hit {
     /// Index space, with the normal along index axes.
     point: FilterPoint,
@@ -54,6 +55,37 @@ struct Hit {
     normal: DVec3,
     view: DVec3,
     albedo: DVec3,
+}
+
+/// A tile as it was drawn, with all that its pixels follow from: of the window around it, nothing where it shows no surface.
+#[derive(Default)]
+pub(super) struct Drawn {
+    /// Red, green, blue, alpha of its pixels.
+    pub rgba8: Vec<u8>,
+    hits: Vec<Option<Hit>>,
+    /// What the pixels that follow rays have seen, and the means of that.
+    raw: Vec<Visibility>,
+    seen: Vec<Visibility>,
+    /// Pixels that followed rays of their own.
+    alone: Vec<bool>,
+    /// How many pixels were drawn anew.
+    pub fresh: usize,
+}
+
+impl Drawn {
+    /// The memory that it takes.
+    pub fn bytes(&self) -> u64 {
+        let window = size_of::<Option<Hit>>() + 2 * size_of::<Visibility>() + 1;
+        (self.rgba8.len() + self.hits.len() * window) as u64
+    }
+}
+
+/// The tile before something in a box (index space) was changed, with where its rays began.
+#[derive(Clone, Copy)]
+pub(super) struct Before<'a> {
+    pub tile: &'a Drawn,
+    pub screen: &'a Screen,
+    pub changed: (DVec3, DVec3),
 }
 
 /// Readers of one tile.
@@ -69,6 +101,15 @@ struct Around {
     reach: i64,
     spacing: i64,
     border: i64,
+}
+
+impl Around {
+    /// How far away they are, and their indices, row by row.
+    fn pixels<'a>(&'a self, window: &'a Window) -> impl Iterator<Item = ((i64, i64), usize)> + 'a {
+        let &Self { at: (x, y), reach, spacing, .. } = self;
+        let along = move |at: i64| (-reach + (reach - at).rem_euclid(spacing)..=reach).step_by(spacing as usize);
+        along(y).flat_map(move |dy| along(x).map(move |dx| ((dx, dy), window.index(x + dx, y + dy))))
+    }
 }
 
 /// What changes between a pixel and its neighbours.
@@ -106,17 +147,44 @@ impl Window {
 }
 
 impl Picture<'_> {
-    /// RGBA of the tile whose first pixel is (x0, y0), row by row, cut at the picture's border.
-    pub fn tile(&self, x0: u32, y0: u32) -> Vec<u8> {
+    /// The first pixels of all tiles.
+    pub fn corners(&self) -> Vec<(u32, u32)> {
+        let columns = |y| (0..self.width).step_by(TILE as usize).map(move |x| (x, y));
+        (0..self.height).step_by(TILE as usize).flat_map(columns).collect()
+    }
+
+    /// Pixels around a tile that it looks at: one for the search for edges, the filter's reach around that.
+    fn rim(&self) -> i64 {
+        REACH * self.spacing + 1
+    }
+
+    /// The picture of all tiles.
+    pub fn assembled<'t>(&self, tiles: impl Iterator<Item = &'t Vec<u8>>) -> Image {
+        let (width, height) = (self.width, self.height);
+        let mut rgba8 = vec![0; width as usize * height as usize * 4];
+        for ((x, y), tile) in self.corners().into_iter().zip(tiles) {
+            let row_bytes = TILE.min(width - x) as usize * 4;
+            for (row, bytes) in (y as usize..).zip(tile.chunks_exact(row_bytes)) {
+                let at = (row * width as usize + x as usize) * 4;
+                rgba8[at..at + row_bytes].copy_from_slice(bytes);
+            }
+        }
+        let mut image = Image { width, height, rgba8 };
+        if matches!(self.color_by, ColorBy::Distortion(_)) {
+            legend::draw(&mut image, 1.0, 1.0 + self.range.0);
+        }
+        image
+    }
+
+    /// The tile whose first pixel is (x0, y0), row by row, cut at the picture's border. What no ray can have found changed is taken
+    /// from the tile before.
+    pub fn tile(&self, (x0, y0): (u32, u32), before: Option<Before<'_>>) -> Drawn {
         let (width, height) = (TILE.min(self.width - x0), TILE.min(self.height - y0));
         let Some(scene) = &self.scene else {
-            return (y0..y0 + height)
-                .flat_map(|y| (x0..x0 + width).flat_map(move |x| self.encode(x, y, DVec4::ZERO)))
-                .collect();
+            let background = |y| (x0..x0 + width).flat_map(move |x| self.encode(x, y, DVec4::ZERO));
+            return Drawn { rgba8: (y0..y0 + height).flat_map(background).collect(), ..Drawn::default() };
         };
-        // One pixel for the search for edges, the filter's reach around that.
-        let (reach, spacing) = (REACH * self.spacing, self.spacing);
-        let rim = reach + 1;
+        let (reach, spacing, rim) = (REACH * self.spacing, self.spacing, self.rim());
         let window = Window {
             x: i64::from(x0) - rim,
             y: i64::from(y0) - rim,
@@ -137,38 +205,59 @@ impl Picture<'_> {
             },
         };
         let centre = DVec2::splat(0.5);
-        let mut hits: Vec<Option<Hit>> = vec![None; window.columns * window.rows];
-        for (x, y, i) in window.pixels(rim) {
-            if lit(x, y) {
-                hits[i] = self.cast(scene, &mut readers, pixel(x, y) + centre);
-            }
-        }
-        for (x, y, i) in window.pixels(1) {
-            if !lit(x, y) {
-                hits[i] = self.cast(scene, &mut readers, pixel(x, y) + centre);
-            }
-        }
-        let mut visibility = |hit: &Hit, (x, y): (i64, i64)| {
-            let at = (hit.point.position, hit.point.normal);
-            let place = (x.div_euclid(spacing), y.div_euclid(spacing));
-            occlusion::visibility(scene, &mut readers.cursor, &self.light, at, place)
+        let count = window.columns * window.rows;
+        let mut hits: Vec<Option<Hit>> = vec![None; count];
+        // Pixels whose rays could find something else; those that did, or that see something else.
+        let (mut touched, mut fresh) = (vec![false; count], vec![false; count]);
+        let mut find = |(x, y, i): (i64, i64, usize)| {
+            let at = pixel(x, y) + centre;
+            touched[i] = before.is_none_or(|before| self.is_touched(at, &before));
+            let old = || before.and_then(|before| before.tile.hits.get(i).copied().flatten());
+            hits[i] = if touched[i] { self.cast(scene, &mut readers, at) } else { old() };
+            fresh[i] = touched[i] && (before.is_none() || hits[i] != old());
         };
-        let mut raw = vec![Visibility::default(); hits.len()];
+        window.pixels(rim).filter(|(x, y, _)| lit(*x, *y)).for_each(&mut find);
+        window.pixels(1).filter(|(x, y, _)| !lit(*x, *y)).for_each(&mut find);
+        let place = |x: i64, y: i64| (x.div_euclid(spacing), y.div_euclid(spacing));
+        let point = |hit: &Hit| (hit.point.position, hit.point.normal);
+        let mut visibility = |hit: &Hit, (x, y): (i64, i64)| {
+            occlusion::visibility(scene, &mut readers.cursor, &self.light, point(hit), place(x, y))
+        };
+        let mut raw = vec![Visibility::default(); count];
         for (x, y, i) in window.pixels(rim).filter(|(x, y, _)| lit(*x, *y)) {
-            if let Some(hit) = &hits[i] {
-                raw[i] = visibility(hit, (x, y));
-            }
+            let Some(hit) = &hits[i] else { continue };
+            let meets = |before: &Before| occlusion::meets(&self.light, point(hit), place(x, y), before.changed);
+            let old = before.filter(|before| !fresh[i] && !meets(before)).and_then(|b| b.tile.raw.get(i).copied());
+            raw[i] = old.unwrap_or_else(|| visibility(hit, (x, y)));
+            fresh[i] |= old.is_none() && before.is_none_or(|b| b.tile.raw.get(i) != Some(&raw[i]));
         }
-        let mut seen = vec![Visibility::default(); hits.len()];
+        let (mut seen, mut alone) = (vec![Visibility::default(); count], vec![false; count]);
+        let mut seen_anew = vec![false; count];
         for (x, y, i) in window.pixels(1) {
-            if let Some(hit) = &hits[i] {
-                let around = Around { at: (x, y), reach, spacing, border: reach };
+            let Some(hit) = &hits[i] else { continue };
+            let around = Around { at: (x, y), reach, spacing, border: reach };
+            alone[i] = before.is_some_and(|before| before.tile.alone.get(i) == Some(&true));
+            let same = !fresh[i] && !alone[i] && !around.pixels(&window).any(|(_, at)| fresh[at]);
+            let old = before.filter(|_| same).and_then(|before| before.tile.seen.get(i).copied());
+            seen[i] = old.unwrap_or_else(|| {
+                let mean = self.mean(&window, &hits, &raw, hit, &around);
+                alone[i] = mean.is_none();
                 // Parts too thin for any of the pixels that follow rays.
-                seen[i] = self.mean(&window, &hits, &raw, hit, around).unwrap_or_else(|| visibility(hit, (x, y)));
-            }
+                mean.unwrap_or_else(|| visibility(hit, (x, y)))
+            });
+            seen_anew[i] = old.is_none();
         }
-        let mut rgba = Vec::with_capacity((width * height * 4) as usize);
-        for (x, y, i) in window.pixels(0) {
+        let mut rgba8 = Vec::with_capacity((width * height * 4) as usize);
+        let mut drawn = 0;
+        for (n, (x, y, i)) in window.pixels(0).enumerate() {
+            let beside = || (0..9).map(|k| window.index(x + k % 3 - 1, y + k / 3 - 1));
+            let same = !touched[i] && !alone[i] && !beside().any(|at| fresh[at] || seen_anew[at]);
+            let old = before.filter(|_| same).and_then(|before| before.tile.rgba8.get(n * 4..n * 4 + 4));
+            if let Some(old) = old {
+                rgba8.extend_from_slice(old);
+                continue;
+            }
+            drawn += 1;
             let samples = match self.edge(&window, &hits, (x, y)) {
                 Edge::None => 1,
                 // Both sides of a crease are there; the outline is finer than that.
@@ -177,22 +266,49 @@ impl Picture<'_> {
             };
             let color = match samples {
                 1 => hits[i].map_or(DVec4::ZERO, |hit| self.color(&hit, seen[i]).extend(1.0)),
-                n => self.supersample(scene, &mut readers, (&window, &hits, &seen), (x, y), n),
+                n => {
+                    let shown = (&window, &hits[..], &seen[..]);
+                    let (color, own) = self.supersample(scene, &mut readers, shown, (x, y), n);
+                    alone[i] |= own;
+                    color
+                }
             };
-            rgba.extend(self.encode(x as u32, y as u32, color));
+            rgba8.extend(self.encode(x as u32, y as u32, color));
         }
-        rgba
+        if hits.iter().all(Option::is_none) && !alone.contains(&true) {
+            return Drawn { rgba8, fresh: drawn, ..Drawn::default() };
+        }
+        Drawn { rgba8, hits, raw, seen, alone, fresh: drawn }
+    }
+
+    /// Whether a ray through the pixel around a point can find something else than before: it passes what was changed, or begins elsewhere.
+    fn is_touched(&self, at: DVec2, before: &Before<'_>) -> bool {
+        let begin = |screen: &Screen| screen.start(at);
+        if self.screen.as_ref().map(begin) != Some(begin(before.screen)) {
+            return true;
+        }
+        let ray = self.ray(at);
+        let (lo, hi) = before.changed;
+        // A pixel is as wide as this where it is farthest.
+        let far = (ray.origin - (lo + hi) / 2.0).length() + (hi - lo).length();
+        let width = far * self.camera.pixel();
+        ray.meets((lo - width, hi + width), f64::INFINITY)
+    }
+
+    /// The ray through a point of the picture, in index space.
+    fn ray(&self, at: DVec2) -> Ray {
+        let to_index = self.transform.to_index();
+        // Unit in index space: voxels are cubes, so lengths are only scaled.
+        Ray::new(
+            to_index.transform_point3(self.camera.eye),
+            to_index.transform_vector3(self.camera.direction(at.x, at.y)) * self.transform.voxel_size(),
+        )
     }
 
     /// What a ray through a point of the picture meets.
     fn cast(&self, scene: &Scene<'_>, readers: &mut Readers<'_>, at: DVec2) -> Option<Hit> {
         let direction = self.camera.direction(at.x, at.y);
-        let to_index = self.transform.to_index();
-        // Unit in index space: voxels are cubes, so lengths are only scaled.
-        let ray = Ray::new(
-            to_index.transform_point3(self.camera.eye),
-            to_index.transform_vector3(direction) * self.transform.voxel_size(),
-        );
+        let ray = self.ray(at);
         let start = self.screen.as_ref().map_or(0.0, |screen| screen.start(at));
         if start.is_infinite() {
             return None;
@@ -238,22 +354,18 @@ impl Picture<'_> {
         hits: &[Option<Hit>],
         values: &[Visibility],
         hit: &Hit,
-        Around { at: (x, y), reach, spacing, border }: Around,
+        around: &Around,
     ) -> Option<Visibility> {
         let (mut sum, mut sky, mut key) = (0.0, 0.0, 0.0);
-        let first = |at: i64| -reach + (reach - at).rem_euclid(spacing);
-        for dy in (first(y)..=reach).step_by(spacing as usize) {
-            for dx in (first(x)..=reach).step_by(spacing as usize) {
-                let at = window.index(x + dx, y + dy);
-                if let Some(other) = &hits[at] {
-                    let distance = hit.footprint * (dx.abs().max(dy.abs()) + 1) as f64;
-                    let weight = filter_weight(dx, border)
-                        * filter_weight(dy, border)
-                        * hit.point.affinity(&other.point, distance);
-                    sum += weight;
-                    sky += weight * values[at].sky;
-                    key += weight * values[at].key;
-                }
+        for ((dx, dy), at) in around.pixels(window) {
+            if let Some(other) = &hits[at] {
+                let distance = hit.footprint * (dx.abs().max(dy.abs()) + 1) as f64;
+                let weight = filter_weight(dx, around.border)
+                    * filter_weight(dy, around.border)
+                    * hit.point.affinity(&other.point, distance);
+                sum += weight;
+                sky += weight * values[at].sky;
+                key += weight * values[at].key;
             }
         }
         (sum > 0.05).then(|| Visibility { sky: sky / sum, key: key / sum })
@@ -283,7 +395,7 @@ impl Picture<'_> {
         edge
     }
 
-    /// The mean of a grid of samples over a pixel, premultiplied.
+    /// The mean of a grid of samples over a pixel, premultiplied, and whether one of them had to follow rays of its own.
     fn supersample(
         &self,
         scene: &Scene<'_>,
@@ -291,8 +403,8 @@ impl Picture<'_> {
         (window, hits, seen): (&Window, &[Option<Hit>], &[Visibility]),
         (x, y): (i64, i64),
         n: u32,
-    ) -> DVec4 {
-        let mut sum = DVec4::ZERO;
+    ) -> (DVec4, bool) {
+        let (mut sum, mut alone) = (DVec4::ZERO, false);
         for k in 0..n * n {
             // Rows and columns sheared against each other, so that upright and level edges get n² steps, not n.
             let (i, j) = (f64::from(k % n), f64::from(k / n));
@@ -300,7 +412,8 @@ impl Picture<'_> {
             let offset = DVec2::new(i + (j + 0.5) / side, j + (i + 0.5) / side) / side;
             if let Some(hit) = self.cast(scene, readers, pixel(x, y) + offset) {
                 let beside = Around { at: (x, y), reach: 1, spacing: 1, border: 2 };
-                let visibility = self.mean(window, hits, seen, &hit, beside).unwrap_or_else(|| {
+                let visibility = self.mean(window, hits, seen, &hit, &beside).unwrap_or_else(|| {
+                    alone = true;
                     // A part too thin for any pixel's centre.
                     let at = (hit.point.position, hit.point.normal);
                     occlusion::visibility(scene, &mut readers.cursor, &self.light, at, (x + i64::from(k), y))
@@ -308,7 +421,7 @@ impl Picture<'_> {
                 sum += self.color(&hit, visibility).extend(1.0);
             }
         }
-        sum / f64::from(n * n)
+        (sum / f64::from(n * n), alone)
     }
 
     /// Displayed colour of a surface point, linear.

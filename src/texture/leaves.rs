@@ -109,7 +109,7 @@ pub(super) fn closed(found: Vec<Found>, full: impl Fn(IVec3) -> Made + Sync, run
         let mut wanted: Vec<[i32; 3]> = new.par_iter().flat_map_iter(beside).collect();
         wanted.sort_unstable();
         wanted.dedup();
-        run.reserve(OPERATION, (made.len() + wanted.len()) as u64 * BYTES_A_LEAF, ADVICE)?;
+        run.reserve(OPERATION, wanted.len() as u64 * BYTES_A_LEAF, ADVICE)?;
         new = wanted.into_iter().map(IVec3::from_array).collect();
         let more: Vec<Box<Made>> = new.par_iter().map(|origin| Box::new(full(*origin))).collect();
         run.check(OPERATION)?;

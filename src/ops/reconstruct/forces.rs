@@ -245,6 +245,8 @@ pub(super) struct Forces<'a> {
     /// By the origin of a leaf.
     known: Mutex<FxHashMap<IVec3, Arc<Known>>>,
     bytes: AtomicU64,
+    /// What was in use before.
+    in_use: u64,
     failure: OnceLock<EditError>,
     /// The bits of the largest Σ V c μ w since it was last asked for.
     stiffness: AtomicU32,
@@ -324,6 +326,7 @@ impl<'a> Forces<'a> {
             run,
             known: Mutex::default(),
             bytes: AtomicU64::new(0),
+            in_use: run.memory_in_use(),
             failure: OnceLock::new(),
             stiffness: AtomicU32::new(0),
         }
@@ -358,7 +361,7 @@ impl<'a> Forces<'a> {
     fn insert(&self, origin: IVec3, known: Known) -> Option<Arc<Known>> {
         let bytes = known.bytes();
         let total = bytes + self.bytes.fetch_add(bytes, Ordering::Relaxed);
-        if let Err(error) = self.run.reserve(NAME, total, "take a larger voxel_size") {
+        if let Err(error) = self.run.reserve_since(self.in_use, NAME, total, "take a larger voxel_size") {
             let _ = self.failure.set(error);
             return None;
         }

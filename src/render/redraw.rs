@@ -1,0 +1,228 @@
+//! A picture drawn again after an edit: only those pixels of which a ray could find something else.
+//!
+//! What has changed lies in a box. A pixel keeps what it showed if neither its ray passes that box, nor one of the rays to the sky and to the key light
+//! of the pixels that its light is the mean of, nor one of a neighbour's that its edges are smoothed with: every number that goes into it is the same. What belongs to
+//! the picture as a whole (camera, lights, extent) must be the same too, or everything is drawn.
+
+use std::mem::{Discriminant, discriminant};
+
+use glam::{DVec3, IVec3};
+use rayon::prelude::*;
+
+use super::camera::Camera;
+use super::png::Image;
+use super::screen::Screen;
+use super::skip::SkipMap;
+use super::tile::{Before, Drawn, Picture};
+use super::{ColorBy, OPERATION, RenderOptions, prepare, render};
+use crate::error::Result;
+use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafId};
+use crate::levelset::LevelSet;
+use crate::run::RunOptions;
+
+/// Pixels of the picture along the side of one of the coarse picture.
+const COARSE: u32 = 4;
+/// The last picture of a view, from which the next one takes what has not changed.
+#[derive(Default)]
+pub struct Redraw {
+    last: Option<Last>,
+    /// Pixels that were drawn for the last picture.
+    drawn: usize,
+}
+
+struct Last {
+    level_set: LevelSet,
+    options: RenderOptions,
+    colors: Discriminant<ColorBy<'static>>,
+    spacing: i64,
+    range: f64,
+    camera: Camera,
+    skip: SkipMap,
+    screen: Screen,
+    tiles: Vec<Drawn>,
+}
+
+impl Redraw {
+    /// As [`render`](super::render), to the bit. Where anything is to be drawn, `coarse` is given a picture of a quarter of the resolution first,
+    /// enlarged to the size of the whole.
+    pub fn render(
+        &mut self,
+        level_set: &LevelSet,
+        color_by: &ColorBy<'_>,
+        options: &RenderOptions,
+        coarse: &mut dyn FnMut(&Image) -> Result<()>,
+        run: &RunOptions,
+    ) -> Result<Image> {
+        let picture = prepare(level_set, color_by, options, run)?;
+        let corners = picture.corners();
+        let last = self.last.take().filter(|last| last.is_of(&picture, level_set, color_by, options));
+        let changed = last.as_ref().map(|last| last.changed(&picture, level_set.grid()));
+        if changed != Some(None) {
+            let small = RenderOptions {
+                width: options.width.div_ceil(COARSE),
+                height: options.height.div_ceil(COARSE),
+                antialias: options.antialias.min(2),
+                ..options.clone()
+            };
+            coarse(&render(level_set, color_by, &small, run)?.enlarged(COARSE, options.width, options.height))?;
+        }
+        let tiles = match (last, changed) {
+            // Nothing that can be seen has changed.
+            (Some(mut last), Some(None)) => {
+                last.tiles.iter_mut().for_each(|tile| tile.fresh = 0);
+                last.tiles
+            }
+            (last, changed) => {
+                let changed = changed.flatten();
+                let before = |n: usize| {
+                    let (last, changed) = (last.as_ref()?, changed?);
+                    Some(Before { tile: last.tiles.get(n)?, screen: &last.screen, changed })
+                };
+                let task = run.task(OPERATION, corners.len() as u64);
+                let draw = |(n, corner): (usize, &(u32, u32))| {
+                    if run.is_cancelled() {
+                        return Drawn::default();
+                    }
+                    let tile = picture.tile(*corner, before(n));
+                    task.advance(1);
+                    tile
+                };
+                corners.par_iter().enumerate().map(draw).collect::<Vec<Drawn>>()
+            }
+        };
+        run.check(OPERATION)?;
+        self.drawn = tiles.iter().map(|tile| tile.fresh).sum();
+        let image = picture.assembled(tiles.iter().map(|tile| &tile.rgba8));
+        let (range, spacing) = (picture.range.0, picture.spacing);
+        let Picture { scene, screen, camera, .. } = picture;
+        if let (Some(scene), Some(screen), Some(colors)) = (scene, screen, local(color_by)) {
+            let (level_set, options, skip) = (level_set.clone(), options.clone(), scene.skip);
+            self.last = Some(Last { level_set, options, colors, spacing, range, camera, skip, screen, tiles });
+        }
+        Ok(image)
+    }
+
+    /// The memory that it takes.
+    pub fn bytes(&self) -> u64 {
+        let tiles = |last: &Last| last.tiles.iter().map(Drawn::bytes).sum::<u64>();
+        self.last.as_ref().map_or(0, |last| last.level_set.grid().bytes() + tiles(last))
+    }
+
+    /// How many pixels were drawn anew for the last picture.
+    pub fn drawn(&self) -> usize {
+        self.drawn
+    }
+}
+
+/// Colours that say something of the surface where they are, and of nothing else.
+fn local(color_by: &ColorBy<'_>) -> Option<Discriminant<ColorBy<'static>>> {
+    match color_by {
+        ColorBy::Clay => Some(discriminant(&ColorBy::Clay)),
+        ColorBy::Normal => Some(discriminant(&ColorBy::Normal)),
+        ColorBy::Curvature => Some(discriminant(&ColorBy::Curvature)),
+        _ => None,
+    }
+}
+
+impl Last {
+    /// Whether a picture has the same view, lights and blocks.
+    fn is_of(
+        &self,
+        picture: &Picture<'_>,
+        level_set: &LevelSet,
+        color_by: &ColorBy<'_>,
+        options: &RenderOptions,
+    ) -> bool {
+        self.options == *options
+            && local(color_by) == Some(self.colors)
+            && self.level_set.transform() == level_set.transform()
+            && (self.spacing, self.range) == (picture.spacing, picture.range.0)
+            && self.camera == picture.camera
+            && picture.scene.as_ref().is_some_and(|scene| scene.skip.is_congruent(&self.skip))
+    }
+
+    /// The box in which rays could find something else, in index space; none if there is nothing. A normal takes values of the leaves around the one in
+    /// which it is. How far the surface is from a block without it does not count, since it only says in how many jumps a ray gets there: it enters a block
+    /// with surface at its face, wherever it came from.
+    fn changed(&self, picture: &Picture<'_>, grid: &Grid) -> Option<(DVec3, DVec3)> {
+        let old = self.level_set.grid();
+        let blocks = picture.scene.iter().flat_map(|scene| scene.skip.changed(&self.skip));
+        let gone = old.leaves().iter().map(|id| old.origin(*id)).filter(|origin| grid.find(*origin).is_sentinel());
+        let (neighbours, neighbours_before) = (grid.neighbours(), old.neighbours());
+        let differs = |id: LeafId| {
+            let before = old.find(grid.origin(id));
+            if before.is_sentinel() {
+                return true;
+            }
+            // Leaves that come or go beside it count for themselves.
+            let beside = neighbours[id.index()].iter().zip(&neighbours_before[before.index()]);
+            let turned = |(now, before): (&LeafId, &LeafId)| now.is_sentinel() && before.is_sentinel() && now != before;
+            let bits = |grid: &Grid, id: LeafId, at: usize| grid.values(id).0[at].to_bits();
+            let same = || (0..LEAF_VOXELS).all(|at| bits(grid, id, at) == bits(old, before, at));
+            let is_shared = before == id && grid.shares_storage(old, id);
+            !(is_shared || same()) || beside.into_iter().any(turned)
+        };
+        let other = grid.map_leaves(|id| differs(id).then(|| grid.origin(id)));
+        let around = |origin: IVec3| ((origin - LEAF_DIM).as_dvec3(), (origin + 2 * LEAF_DIM).as_dvec3());
+        let leaves = gone.chain(other.into_iter().flatten()).map(around);
+        blocks.chain(leaves).reduce(|(a, b), (c, d)| (a.min(c), b.max(d)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::grid::Transform;
+    use crate::render::testing::shape;
+
+    /// A ball above a board, and a dent of the board of some depth at a place.
+    fn scene(at: DVec3, depth: f64) -> LevelSet {
+        shape(Transform::uniform(0.5), 3.0, 100, |p| {
+            let ball = (p - DVec3::new(-20.0, 30.0, 0.0)).length() - 18.0;
+            let board = (p.abs() - DVec3::new(90.0, 8.0, 60.0)).max_element();
+            let dent = depth * (1.0 - (p - at).length_squared() / 64.0).max(0.0);
+            ball.min(board + dent)
+        })
+    }
+
+    #[test]
+    fn a_picture_drawn_again_is_the_same_to_the_bit() {
+        let run = RunOptions::default();
+        let options = RenderOptions { width: 500, height: 400, ..RenderOptions::default() };
+        let mut redraw = Redraw::default();
+        let mut coarse = 0;
+        for (n, (at, depth)) in [
+            (DVec3::new(70.0, 8.0, 40.0), 0.0),
+            (DVec3::new(70.0, 8.0, 40.0), 1.5),
+            // In the shadow of the ball, which hides it from the camera in part.
+            (DVec3::new(-10.0, 8.0, 10.0), 1.5),
+            (DVec3::new(-10.0, 8.0, 10.0), 1.5),
+        ]
+        .into_iter()
+        .enumerate()
+        {
+            let level_set = scene(at, depth);
+            let count = &mut |image: &Image| {
+                assert_eq!((image.width, image.height), (500, 400));
+                coarse += 1;
+                Ok(())
+            };
+            let again = redraw.render(&level_set, &ColorBy::Clay, &options, count, &run).unwrap();
+            let whole = render(&level_set, &ColorBy::Clay, &options, &run).unwrap();
+            assert!(again == whole, "{n}");
+            let (drawn, all) = (redraw.drawn(), 500 * 400);
+            match n {
+                0 => assert_eq!(drawn, all),
+                3 => assert_eq!(drawn, 0),
+                _ => assert!((1..all / 2).contains(&drawn), "{n}: {drawn} of {all}"),
+            }
+        }
+        assert!(coarse >= 1);
+        // Another view is drawn whole.
+        let mut turned = options.clone();
+        turned.camera.azimuth += 1.0;
+        let level_set = scene(DVec3::new(-10.0, 8.0, 10.0), 1.5);
+        redraw.render(&level_set, &ColorBy::Clay, &turned, &mut |_| Ok(()), &run).unwrap();
+        assert_eq!(redraw.drawn(), 500 * 400);
+    }
+}
