@@ -11,6 +11,9 @@ use common::{Ended, names, vdb_edit};
 /// Longest that one command may take on a loaded machine.
 const LIMIT: Duration = Duration::from_secs(600);
 
+/// Bytes that are filled while the thread that watches waits for its turn on a loaded machine.
+const LATE: f64 = (16 << 20) as f64;
+
 #[track_caller]
 fn done(words: &[&str], folder: &Path) -> Ended {
     let ended = vdb_edit(words, folder, LIMIT);
@@ -41,7 +44,7 @@ fn holds_its_limit(words: &[&str], folder: &Path) {
             ended.code(),
             peak as f64 / limit as f64
         );
-        assert!(peak as f64 <= 1.1 * limit as f64, "{words:?}: {peak} bytes with a limit of {limit}");
+        assert!(peak as f64 <= 1.1 * limit as f64 + LATE, "{words:?}: {peak} bytes with a limit of {limit}");
         match ended.code() {
             Some(0) => assert!(part > 0.5, "{words:?} with {part} of what it takes"),
             Some(5) => {

@@ -339,3 +339,34 @@ fn depths_of_exr_and_colours() {
         assert!(read(&folder, "set.toml", false).is_err());
     }
 }
+
+#[test]
+fn noise_is_estimated_beside_jumps_and_where_depths_come_in_steps() {
+    const WIDTH: usize = 160;
+    let projection = Projection::Orthographic { first: DVec2::ZERO, pitch: DVec2::ONE };
+    // Four uniform numbers that are the same everywhere make a normal one.
+    let normal = |at: usize| {
+        let uniform = |k: usize| {
+            let h = (at * 4 + k + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15_u64 as usize);
+            let h = (h ^ h >> 29).wrapping_mul(0xbf58_476d_1ce4_e5b9_u64 as usize);
+            (h >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        };
+        (0..4).map(uniform).sum::<f64>() * 3f64.sqrt()
+    };
+    for (noise, step) in [(0.02, 0.0), (0.02, 0.02), (0.01, 0.04)] {
+        let depth = |at: usize| {
+            // A slope with a jump in each row.
+            let (u, v) = (at % WIDTH, at / WIDTH);
+            let depth = 5.0 + 0.003 * u as f64 + f64::from(u8::from(u > 40 + v % 60)) + noise * normal(at);
+            if step > 0.0 { ((depth / step).round() * step) as f32 } else { depth as f32 }
+        };
+        let ranges: Vec<f32> = (0..WIDTH * 120).map(depth).collect();
+        let map = RangeMap::new("steps".into(), projection, DAffine3::IDENTITY, WIDTH, ranges);
+        let expected = f64::hypot(noise, step / 12f64.sqrt());
+        let estimated = map.estimated_noise().unwrap();
+        println!("noise {noise} in steps of {step}: {estimated:.5} of {expected:.5}");
+        // Steps larger than the noise are not normal.
+        let tolerance = if step > noise { 0.5 } else { 0.1 };
+        assert!((estimated / expected - 1.0).abs() < tolerance, "{noise} {step}: {estimated} {expected}");
+    }
+}
