@@ -3,7 +3,7 @@
 //! Grids of a `.vdb` are verified, meshes converted; outputs are settled before any work and written at its end.
 
 // Recipes need part of it, the command all of it.
-#![cfg_attr(not(feature = "cli"), allow(dead_code))]
+#![cfg_attr(not(feature = "cli"), allow(dead_code, unused_imports))]
 
 pub mod frames;
 mod grids;
