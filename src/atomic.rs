@@ -110,9 +110,8 @@ impl Pending {
             Err(_) => None,
         };
         let suffix = target.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
-        let file = temporary_in(folder_of(target), &suffix).map_err(|e| failed(path, e))?;
-        let unfinished = Unfinished::new(file.path());
-        Ok(Self { path: path.into(), target: target.into(), file, permissions, _unfinished: unfinished })
+        let (_unfinished, file) = temporary_in(folder_of(target), &suffix).map_err(|e| failed(path, e))?;
+        Ok(Self { path: path.into(), target: target.into(), file, permissions, _unfinished })
     }
 
     fn finish(self) -> Result<()> {
@@ -133,18 +132,21 @@ impl Pending {
     }
 }
 
-/// A new temporary file in a folder.
-pub(crate) fn temporary_in(folder: &Path, suffix: &str) -> io::Result<NamedTempFile> {
+/// A new temporary file in a folder, and what notes it for [`remove_unfinished`] and is to outlive it.
+pub(crate) fn temporary_in(folder: &Path, suffix: &str) -> io::Result<(Unfinished, NamedTempFile)> {
     remove_abandoned(folder);
     let mut builder = tempfile::Builder::new();
     builder.prefix(PREFIX).suffix(suffix);
     // Temporary files are private (0600) by default; a result should be as readable as any file the user creates.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    // Made and noted at once: a process that ends in between would leave it.
+    let mut unfinished = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
     let file = builder.tempfile_in(folder)?;
+    unfinished.push(file.path().into());
     // Where files cannot be locked, abandoned ones stay.
     let _ = file.as_file().try_lock();
-    Ok(file)
+    Ok((Unfinished(file.path().into()), file))
 }
 
 /// Removes the temporary files of a folder that processes left when they were killed. What cannot be removed stays.
@@ -163,15 +165,8 @@ fn remove_abandoned(folder: &Path) {
 /// Temporary files that are being filled.
 static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
 
-/// Notes a temporary file for as long as it lives, for [`remove_unfinished`].
+/// That a temporary file is noted for [`remove_unfinished`].
 pub(crate) struct Unfinished(PathBuf);
-
-impl Unfinished {
-    pub(crate) fn new(path: &Path) -> Self {
-        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).push(path.into());
-        Self(path.into())
-    }
-}
 
 impl Drop for Unfinished {
     fn drop(&mut self) {
@@ -179,12 +174,14 @@ impl Drop for Unfinished {
     }
 }
 
-/// Removes all temporary files that are being filled: for a process that is about to end without unwinding.
+/// Removes all temporary files that are being filled: for a process that is about to end without unwinding. Nobody can make one afterwards.
 pub fn remove_unfinished() {
-    for path in UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).drain(..) {
+    let mut unfinished = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
+    for path in unfinished.drain(..) {
         // One that has just been renamed is no longer there, and its target is complete.
         let _ = fs::remove_file(path);
     }
+    std::mem::forget(unfinished);
 }
 
 fn folder_of(target: &Path) -> &Path {

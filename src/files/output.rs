@@ -188,5 +188,7 @@ pub fn writable(path: &Path) -> Result<()> {
         return Err(EditError::output(path, format!("there is no folder `{}`", folder.display())));
     }
     let probe = atomic::temporary_in(folder, "");
-    probe.map(drop).map_err(|e| EditError::output(path, format!("no file can be made in `{}`: {e}", folder.display())))
+    probe
+        .map(|(_unfinished, file)| drop(file))
+        .map_err(|e| EditError::output(path, format!("no file can be made in `{}`: {e}", folder.display())))
 }

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::bridge::ffi;
 use super::listing::{Compression, Precision};
 use super::read::{PIPE, VdbFile};
-use crate::atomic::{Unfinished, final_target, temporary_in};
+use crate::atomic::{final_target, temporary_in};
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, Transform};
 use crate::levelset::{Field, LevelSet};
@@ -313,8 +313,7 @@ impl Target<'_> {
             _ => PathBuf::from("."),
         };
         let in_folder = format!("no file can be made in {}", folder.display());
-        let temporary = temporary_in(&folder, ".vdb").map_err(self.io(&in_folder))?;
-        let _unfinished = Unfinished::new(temporary.path());
+        let (_unfinished, temporary) = temporary_in(&folder, ".vdb").map_err(self.io(&in_folder))?;
         let name = temporary.path().as_os_str().as_encoded_bytes();
         content.as_mut().write_path(name, compression).map_err(|e| self.error(e.what()))?;
         // The disk and the processor have different work to do.
