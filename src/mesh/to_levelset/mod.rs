@@ -176,13 +176,10 @@ fn repair(
     let half_width = params.half_width;
     let doubtful = doubts.triangles(clean);
     run.check(OPERATION)?;
-
     let pieces = separating_pieces(clean, &doubtful, doubts, run)?;
-
     findings.removed_area_fraction = pieces.removed_area_fraction;
     run.check(OPERATION)?;
     let mut kept = DistanceLeaves::new(distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?);
-
     // The surface may go on where triangles were left out.
     let suspects: Vec<IVec3> = if pieces.removed_area_fraction > 0.0 {
         let marked: Vec<usize> = (0..doubtful.len()).filter(|&t| doubtful[t]).collect();
@@ -193,13 +190,10 @@ fn repair(
     };
     let mut surroundings = Surroundings::new(&doubts.inside);
     let closure = surroundings.close(&kept, &suspects, half_width, run)?;
-
     findings.closure_triangles = closure.len();
     kept.merge(distance_to_triangles(closure.len(), |t| closure[t], half_width, run)?);
-
     let unsigned: Vec<_> = kept.origins().filter(|o| surroundings.mask(*o).is_none()).collect();
     surroundings.extend(&unsigned);
-
     let signed = |leaf: &UnsignedLeaf| {
         signed(leaf.origin, &leaf.distance, &surroundings.mask(leaf.origin).copied().unwrap_or_default(), params)
     };
