@@ -22,6 +22,7 @@ use crate::run::RunOptions;
 
 /// Pixels of the picture along the side of one of the coarse picture.
 const COARSE: u32 = 4;
+
 /// The last picture of a view, from which the next one takes what has not changed.
 #[derive(Default)]
 pub struct Redraw {

@@ -198,7 +198,9 @@ fn verdicts_together(
         let own = piece.radius_about(center);
         let widest = if rim.is_empty() { f64::MAX } else { TOGETHER.max(2.0 * own) };
         // The verdict for all triangles within some distance, or at least for this one.
-        let decided = [widest, own].into_iter().find(|&radius| decides(front, center, radius, rim));
+        let decided = [widest, own]
+            .into_iter()
+            .find(|&radius| error_in_front(center, radius, rim).is_some_and(|error| is_clear(front, error)));
         let Some(radius) = decided else { continue };
         // Behind a triangle w is one more than in front: ½ lies between for |front| < ½.
         let verdict = Some(front.abs() < 0.5);
@@ -224,29 +226,32 @@ fn judge_by_front(
     inside: &Inside<'_>,
     rim: &Rim,
 ) -> Vec<Option<bool>> {
-    // How far the winding number may be off elsewhere in front; most pieces near the boundary are passed over here.
+    // Most pieces near the boundary are passed over here, before anything is asked that takes longer.
     let error = |piece: &Piece| {
         let center = piece.center();
-        let radius = piece.radius_about(center);
-        let slope = rim.steepest(center, radius, 0.5 / radius.max(f64::MIN_POSITIVE))?;
-        (!touched(piece)).then_some(WINDING_ERROR + slope * radius)
+        error_in_front(center, piece.radius_about(center), rim).filter(|_| !touched(piece))
     };
     let errors: Vec<Option<f64>> = pieces.par_iter().map(error).collect();
     let asked: Vec<usize> = (0..pieces.len()).filter(|&i| errors[i].is_some()).collect();
     let mut verdicts = vec![None; pieces.len()];
     for (&i, front) in asked.iter().zip(windings(asked.len(), |i| pieces[asked[i]].beside(1.0), inside)) {
         // Behind it the winding number is one more.
-        let clear = errors[i].is_some_and(|error| (front.abs() - 0.5).abs() > error);
+        let clear = errors[i].is_some_and(|error| is_clear(front, error));
         verdicts[i] = clear.then_some(front.abs() < 0.5);
     }
     verdicts
 }
 
-/// Whether the winding number in front of connected triangles within `radius` of `center` stays as far from ½ and −½, where
-/// their verdict changes, as `front` shows it to be.
-fn decides(front: f64, center: DVec3, radius: f64, rim: &Rim) -> bool {
-    let Some(slope) = rim.steepest(center, radius, 0.5 / radius.max(f64::MIN_POSITIVE)) else { return false };
-    (front.abs() - 0.5).abs() > WINDING_ERROR + slope * radius
+/// How far the winding number in front of connected triangles within `radius` of `center` may be from what it is at one point there;
+/// `None` if that says nothing, as near the boundary.
+fn error_in_front(center: DVec3, radius: f64, rim: &Rim) -> Option<f64> {
+    let slope = rim.steepest(center, radius, 0.5 / radius.max(f64::MIN_POSITIVE))?;
+    Some(WINDING_ERROR + slope * radius)
+}
+
+/// Whether the winding number stays on its side of ½ and −½, where the verdict changes.
+fn is_clear(front: f64, error: f64) -> bool {
+    (front.abs() - 0.5).abs() > error
 }
 
 /// Winding numbers at points that lie near those before them.
