@@ -377,10 +377,9 @@ impl Search<'_> {
                 let first = half.origin - block.origin;
                 for (x, y) in (0..BLOCK).flat_map(|x| (0..BLOCK).map(move |y| (x, y))) {
                     let start = leaf_offset(first + IVec3::new(x, y, 0));
-                    for at in start..start + BLOCK as usize {
-                        values.0[at] = field[at];
-                        active.set(at, was.get(at));
-                    }
+                    let row = start..start + BLOCK as usize;
+                    values.0[row.clone()].copy_from_slice(&field[row.clone()]);
+                    row.for_each(|at| active.set(at, was.get(at)));
                 }
                 continue;
             }
