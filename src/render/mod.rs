@@ -243,8 +243,15 @@ fn prepare<'a>(
         antialias: options.antialias,
         width,
         height,
-        background: (!options.transparent_background).then(|| options.background.map(shade::decode)),
+        background: (!options.transparent_background).then(|| background(options)),
     })
+}
+
+/// Colours of the rows of the background, linear and as displayed.
+fn background(options: &RenderOptions) -> Vec<[DVec3; 2]> {
+    let [top, bottom] = options.background.map(shade::decode);
+    let row = |y| top.lerp(bottom, (f64::from(y) + 0.5) / f64::from(options.height));
+    (0..options.height).map(row).map(|linear| [linear, shade::display(linear)]).collect()
 }
 
 #[cfg(test)]

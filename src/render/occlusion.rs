@@ -81,11 +81,18 @@ pub(super) fn visibility(
 /// Whether one of the rays of [`visibility`] passes through a box.
 pub(super) fn meets(light: &Light, (point, normal): (DVec3, DVec3), at: (i64, i64), bounds: (DVec3, DVec3)) -> bool {
     let (origin, class) = (point + normal * LIFT, class_of(at));
+    // Most are decided by a ball around the box: too far or below the horizon for the sky, beside the cone towards the light.
+    let (to, radius) = ((bounds.0 + bounds.1) / 2.0 - origin, (bounds.1 - bounds.0).length() / 2.0);
+    let distance = to.length();
+    let (along, reach) = (to.dot(light.key), light.range + radius);
+    let across = (distance * distance - along * along).max(0.0).sqrt();
+    let is_in_sky = distance <= reach && to.dot(normal) > -radius;
+    let is_to_key = along > -radius && across - radius <= (along + radius) * LIGHT_RADIUS;
     let pair = normal.any_orthonormal_pair();
     let to_sky = |k| light.to_sky((origin, normal), pair, k, class).meets(bounds, light.range);
     let pair = light.key.any_orthonormal_pair();
     let to_key = |k| light.to_key(origin, pair, k, class).meets(bounds, f64::INFINITY);
-    (0..light.sky_rays).any(to_sky) || (0..light.key_rays).any(to_key)
+    is_in_sky && (0..light.sky_rays).any(to_sky) || is_to_key && (0..light.key_rays).any(to_key)
 }
 
 /// The place of a pixel in the pattern.

@@ -6,14 +6,14 @@
 
 use std::mem::{Discriminant, discriminant};
 
-use glam::{DVec3, IVec3};
+use glam::{DVec2, DVec3, IVec3};
 use rayon::prelude::*;
 
 use super::camera::Camera;
 use super::png::Image;
 use super::screen::Screen;
 use super::skip::SkipMap;
-use super::tile::{Before, Drawn, Picture};
+use super::tile::{Change, Drawn, Picture};
 use super::{ColorBy, OPERATION, RenderOptions, prepare, render};
 use crate::error::Result;
 use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafId};
@@ -22,6 +22,8 @@ use crate::run::RunOptions;
 
 /// Pixels of the picture along the side of one of the coarse picture.
 const COARSE: u32 = 4;
+/// Part of the picture that an edit may cover without a coarse picture: the whole one is as soon there.
+const LOCAL: f64 = 0.125;
 
 /// The last picture of a view, from which the next one takes what has not changed.
 #[derive(Default)]
@@ -44,8 +46,8 @@ struct Last {
 }
 
 impl Redraw {
-    /// As [`render`](super::render), to the bit. Where anything is to be drawn, `coarse` is given a picture of a quarter of the resolution first,
-    /// enlarged to the size of the whole.
+    /// As [`render`](super::render), to the bit. Where more than an eighth of the picture may change, `coarse` is given a picture of a quarter of the
+    /// resolution first, enlarged to the size of the whole.
     pub fn render(
         &mut self,
         level_set: &LevelSet,
@@ -58,7 +60,13 @@ impl Redraw {
         let corners = picture.corners();
         let last = self.last.take().filter(|last| last.is_of(&picture, level_set, color_by, options));
         let changed = last.as_ref().map(|last| last.changed(&picture, level_set.grid()));
-        if changed != Some(None) {
+        let pixels = changed.map(|changed| changed.map(|bounds| picture.pixels_of(bounds)));
+        let is_local = |(lo, hi): (DVec2, DVec2)| {
+            let size = DVec2::new(options.width.into(), options.height.into());
+            let shown = (hi.min(size) - lo.max(DVec2::ZERO)).max(DVec2::ZERO);
+            shown.element_product() <= LOCAL * size.element_product()
+        };
+        if pixels.is_none_or(|pixels| pixels.is_some_and(|pixels| !is_local(pixels))) {
             let small = RenderOptions {
                 width: options.width.div_ceil(COARSE),
                 height: options.height.div_ceil(COARSE),
@@ -67,29 +75,28 @@ impl Redraw {
             };
             coarse(&render(level_set, color_by, &small, run)?.enlarged(COARSE, options.width, options.height))?;
         }
-        let tiles = match (last, changed) {
+        let (mut old, screen) = last.map_or((Vec::new(), None), |last| (last.tiles, Some(last.screen)));
+        let change = match (&screen, changed.flatten(), pixels.flatten()) {
+            (Some(screen), Some(bounds), Some(pixels)) => Some(Change { screen, bounds, pixels }),
+            _ => None,
+        };
+        let tiles = if changed == Some(None) {
             // Nothing that can be seen has changed.
-            (Some(mut last), Some(None)) => {
-                last.tiles.iter_mut().for_each(|tile| tile.fresh = 0);
-                last.tiles
-            }
-            (last, changed) => {
-                let changed = changed.flatten();
-                let before = |n: usize| {
-                    let (last, changed) = (last.as_ref()?, changed?);
-                    Some(Before { tile: last.tiles.get(n)?, screen: &last.screen, changed })
-                };
-                let task = run.task(OPERATION, corners.len() as u64);
-                let draw = |(n, corner): (usize, &(u32, u32))| {
-                    if run.is_cancelled() {
-                        return Drawn::default();
-                    }
-                    let tile = picture.tile(*corner, before(n));
-                    task.advance(1);
-                    tile
-                };
-                corners.par_iter().enumerate().map(draw).collect::<Vec<Drawn>>()
-            }
+            old.iter_mut().for_each(|tile| tile.fresh = 0);
+            old
+        } else {
+            let task = run.task(OPERATION, corners.len() as u64);
+            let mut old: Vec<Option<Drawn>> = old.into_iter().map(Some).collect();
+            old.resize_with(corners.len(), || None);
+            let draw = |(corner, old): ((u32, u32), Option<Drawn>)| {
+                if run.is_cancelled() {
+                    return Drawn::default();
+                }
+                let tile = picture.tile(corner, old.zip(change.as_ref()));
+                task.advance(1);
+                tile
+            };
+            corners.into_par_iter().zip(old).map(draw).collect::<Vec<Drawn>>()
         };
         run.check(OPERATION)?;
         self.drawn = tiles.iter().map(|tile| tile.fresh).sum();
