@@ -102,9 +102,10 @@ mod tests {
             assert_eq!(number(value), text);
         }
         assert_eq!([count(0), count(999), count(1000), count(1234567)], ["0", "999", "1,000", "1,234,567"]);
-        assert_eq!([json!(13764), json!(-3), json!(1.392665490040933), json!("a b")].map(|v| value(&v)), [
-            "13,764", "-3", "1.3927", "a b"
-        ]);
+        assert_eq!(
+            [json!(13764), json!(-3), json!(1.392665490040933), json!("a b")].map(|v| value(&v)),
+            ["13,764", "-3", "1.3927", "a b"]
+        );
         assert_eq!(change(2.0, 1.0), "-50.000 %");
         assert_eq!(change(0.0, 1.0), "");
     }

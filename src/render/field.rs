@@ -95,7 +95,8 @@ impl<'a> Cursor<'a> {
         if local.max_element() < LEAF_DIM - 1 {
             let values = &self.leaf.0[leaf_offset(ijk)..];
             // Within one leaf x is 64 apart, y 8, z 1.
-            [0, 1, 8, 9, 64, 65, 72, 73].map(|step| values[step])
+            let at = |step: usize| values[step];
+            [at(0), at(1), at(8), at(9), at(64), at(65), at(72), at(73)]
         } else {
             self.border_cell(local)
         }
@@ -105,14 +106,11 @@ impl<'a> Cursor<'a> {
     fn border_cell(&self, local: IVec3) -> [f32; 8] {
         // Bits x, y, z.
         let beyond = local.cmpeq(IVec3::splat(LEAF_DIM - 1)).bitmask() as usize;
-        let leaf = |side: usize| self.around(13 + (side & 1) * 9 + (side >> 1 & 1) * 3 + (side >> 2));
         // The leaf of a corner is found once for all corners in it: mostly two.
         let mut leaves = [self.leaf; 8];
-        if beyond.is_power_of_two() {
-            leaves[beyond] = leaf(beyond);
-        } else {
-            for side in (1..8).filter(|side| side & !beyond == 0) {
-                leaves[side] = leaf(side);
+        for side in 1..8 {
+            if side & !beyond == 0 {
+                leaves[side] = self.around(13 + (side & 1) * 9 + (side >> 1 & 1) * 3 + (side >> 2));
             }
         }
         let mut corners = [0.0; 8];

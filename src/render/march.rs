@@ -24,7 +24,7 @@ const PARALLEL: f64 = 1e-9;
 pub(super) struct Ray {
     pub origin: DVec3,
     pub direction: DVec3,
-    inverse: DVec3,
+    pub inverse: DVec3,
 }
 
 impl Ray {
@@ -46,15 +46,9 @@ impl Ray {
         Self { origin: self.at(t), ..*self }
     }
 
-    /// Whether the ray passes through a box before `t_end`.
-    pub fn meets(&self, bounds: (DVec3, DVec3), t_end: f64) -> bool {
-        let (enter, leave) = self.crossing(bounds);
-        enter <= leave && leave >= 0.0 && enter <= t_end
-    }
-
     /// Entry and exit of a box.
     #[inline(always)]
-    fn crossing(&self, (lo, hi): (DVec3, DVec3)) -> (f64, f64) {
+    pub fn crossing(&self, (lo, hi): (DVec3, DVec3)) -> (f64, f64) {
         let (a, b) = ((lo - self.origin) * self.inverse, (hi - self.origin) * self.inverse);
         (a.min(b).max_element(), a.max(b).min_element())
     }
@@ -143,7 +137,8 @@ impl Scene<'_> {
             let (low, high) = extremes(&corners);
             let exit = faces.min_element();
             if low < 0.0 && high >= 0.0 {
-                let corners = corners.map(f64::from);
+                let [a, b, c, d, e, f, g, h] = corners;
+                let corners = [a.into(), b.into(), c.into(), d.into(), e.into(), f.into(), g.into(), h.into()];
                 let at = t + f64::from(s);
                 let cubic = Cubic::along(&corners, ray.at(at) - cell.as_dvec3(), ray.direction);
                 let length = f64::from((exit - s).max(0.0));

@@ -1,6 +1,6 @@
 //! A picture drawn again after an edit: only those pixels of which a ray could find something else.
 //!
-//! What has changed lies in a box. A pixel keeps what it showed if neither its ray passes that box, nor one of the rays to the sky and to the key light
+//! What has changed lies in some cubes of space. A pixel keeps what it showed if neither its ray passes one of them, nor one of the rays to the sky and to the key light
 //! of the pixels that its light is the mean of, nor one of a neighbour's that its edges are smoothed with: every number that goes into it is the same. What belongs to
 //! the picture as a whole (camera, lights, extent) must be the same too, or everything is drawn.
 
@@ -10,6 +10,7 @@ use glam::{DVec2, DVec3, IVec3};
 use rayon::prelude::*;
 
 use super::camera::Camera;
+use super::change::Changed;
 use super::png::Image;
 use super::screen::Screen;
 use super::skip::SkipMap;
@@ -22,6 +23,8 @@ use crate::run::RunOptions;
 
 /// Pixels of the picture along the side of one of the coarse picture.
 const COARSE: u32 = 4;
+/// How far away (voxels) values may be that a normal is made of.
+const TAPS: f64 = 2.0;
 /// Part of the picture that an edit may cover without a coarse picture: the whole one is as soon there.
 const LOCAL: f64 = 0.125;
 
@@ -60,7 +63,8 @@ impl Redraw {
         let corners = picture.corners();
         let last = self.last.take().filter(|last| last.is_of(&picture, level_set, color_by, options));
         let changed = last.as_ref().map(|last| last.changed(&picture, level_set.grid()));
-        let pixels = changed.map(|changed| changed.map(|bounds| picture.pixels_of(bounds)));
+        let pixels =
+            changed.as_ref().map(|changed| changed.as_ref().map(|changed| picture.pixels_of(changed.bounds())));
         let is_local = |(lo, hi): (DVec2, DVec2)| {
             let size = DVec2::new(options.width.into(), options.height.into());
             let shown = (hi.min(size) - lo.max(DVec2::ZERO)).max(DVec2::ZERO);
@@ -76,11 +80,12 @@ impl Redraw {
             coarse(&render(level_set, color_by, &small, run)?.enlarged(COARSE, options.width, options.height))?;
         }
         let (mut old, screen) = last.map_or((Vec::new(), None), |last| (last.tiles, Some(last.screen)));
+        let is_same = pixels == Some(None);
         let change = match (&screen, changed.flatten(), pixels.flatten()) {
-            (Some(screen), Some(bounds), Some(pixels)) => Some(Change { screen, bounds, pixels }),
+            (Some(screen), Some(changed), Some(pixels)) => Some(Change { screen, changed, pixels }),
             _ => None,
         };
-        let tiles = if changed == Some(None) {
+        let tiles = if is_same {
             // Nothing that can be seen has changed.
             old.iter_mut().for_each(|tile| tile.fresh = 0);
             old
@@ -149,18 +154,18 @@ impl Last {
             && picture.scene.as_ref().is_some_and(|scene| scene.skip.is_congruent(&self.skip))
     }
 
-    /// The box in which rays could find something else, in index space; none if there is nothing. A normal takes values of the leaves around the one in
-    /// which it is. How far the surface is from a block without it does not count, since it only says in how many jumps a ray gets there: it enters a block
-    /// with surface at its face, wherever it came from.
-    fn changed(&self, picture: &Picture<'_>, grid: &Grid) -> Option<(DVec3, DVec3)> {
+    /// Where rays could find something else; none if there is nothing. A normal takes values up to two voxels away. How far the surface is from a block
+    /// without it does not count, since it only says in how many jumps a ray gets there: it enters a part with surface at its face, wherever it
+    /// came from.
+    fn changed(&self, picture: &Picture<'_>, grid: &Grid) -> Option<Changed> {
         let old = self.level_set.grid();
-        let blocks = picture.scene.iter().flat_map(|scene| scene.skip.changed(&self.skip));
+        let parts = picture.scene.iter().flat_map(|scene| scene.skip.changed(&self.skip));
         let gone = old.leaves().iter().map(|id| old.origin(*id)).filter(|origin| grid.find(*origin).is_sentinel());
         let (neighbours, neighbours_before) = (grid.neighbours(), old.neighbours());
         let differs = |id: LeafId| {
             let before = old.find(grid.origin(id));
             if before.is_sentinel() {
-                return true;
+                return Some(0);
             }
             // Leaves that come or go beside it count for themselves.
             let beside = neighbours[id.index()].iter().zip(&neighbours_before[before.index()]);
@@ -168,12 +173,17 @@ impl Last {
             let bits = |grid: &Grid, id: LeafId, at: usize| grid.values(id).0[at].to_bits();
             let same = || (0..LEAF_VOXELS).all(|at| bits(grid, id, at) == bits(old, before, at));
             let is_shared = before == id && grid.shares_storage(old, id);
-            !(is_shared || same()) || beside.into_iter().any(turned)
+            if beside.into_iter().any(turned) {
+                return Some(LEAF_DIM);
+            }
+            (!(is_shared || same())).then_some(0)
         };
-        let other = grid.map_leaves(|id| differs(id).then(|| grid.origin(id)));
-        let around = |origin: IVec3| ((origin - LEAF_DIM).as_dvec3(), (origin + 2 * LEAF_DIM).as_dvec3());
-        let leaves = gone.chain(other.into_iter().flatten()).map(around);
-        blocks.chain(leaves).reduce(|(a, b), (c, d)| (a.min(c), b.max(d)))
+        let other = grid.map_leaves(|id| differs(id).map(|margin| (grid.origin(id), margin)));
+        let leaf = |(lo, margin): (IVec3, i32)| ((lo - margin).as_dvec3(), (lo + LEAF_DIM + margin).as_dvec3());
+        let leaves = gone.map(|origin| (origin, 0)).chain(other.into_iter().flatten()).map(leaf);
+        let boxes: Vec<(DVec3, DVec3)> = parts.chain(leaves).collect();
+        let all = boxes.iter().copied().reduce(|(a, b), (c, d)| (a.min(c), b.max(d)))?;
+        Changed::of(&boxes, TAPS + picture.widest(all))
     }
 }
 

@@ -6,6 +6,7 @@
 use glam::{DVec2, DVec3, DVec4, IVec3};
 
 use super::camera::Camera;
+use super::change::Changed;
 use super::field::Cursor;
 use super::march::{Ray, Scene, Start};
 use super::occlusion::{self, FilterPoint, Light, REACH, Visibility, filter_weight};
@@ -83,10 +84,10 @@ impl Drawn {
     }
 }
 
-/// What was changed since the last picture: something in a box (index space), of which pixels within a rectangle may show some. Where its rays began.
+/// What was changed since the last picture, and the rectangle of pixels that may show it. Where its rays began.
 pub(super) struct Change<'a> {
     pub screen: &'a Screen,
-    pub bounds: (DVec3, DVec3),
+    pub changed: Changed,
     pub pixels: (DVec2, DVec2),
 }
 
@@ -227,7 +228,7 @@ impl Picture<'_> {
             let mut shown =
                 shown.filter_map(|(hit, (x, y, _))| hit.as_ref().filter(|_| lit(x, y)).map(|hit| (hit, place(x, y))));
             let is_touched = || window.pixels(rim).any(|(x, y, _)| self.is_touched(pixel(x, y) + 0.5, change));
-            let meets = |(hit, at): (&Hit, _)| occlusion::meets(&self.light, point(hit), at, change.bounds);
+            let meets = |(hit, at): (&Hit, _)| occlusion::meets(&self.light, point(hit), at, &change.changed);
             if !tile.alone.contains(&true) && !is_touched() && !shown.any(meets) {
                 return before.map(|(tile, _)| Drawn { fresh: 0, ..tile }).unwrap_or_default();
             }
@@ -264,7 +265,8 @@ impl Picture<'_> {
         let mut raw = vec![Visibility::default(); count];
         for (x, y, i) in window.pixels(rim).filter(|(x, y, _)| lit(*x, *y)) {
             let Some(hit) = &hits[i] else { continue };
-            let meets = |before: &Before| occlusion::meets(&self.light, point(hit), place(x, y), before.change.bounds);
+            let meets =
+                |before: &Before| occlusion::meets(&self.light, point(hit), place(x, y), &before.change.changed);
             let old = before.filter(|before| !fresh[i] && !meets(before)).and_then(|b| b.tile.raw.get(i).copied());
             raw[i] = old.unwrap_or_else(|| visibility(hit, (x, y)));
             fresh[i] |= old.is_none() && before.is_none_or(|b| b.tile.raw.get(i) != Some(&raw[i]));
@@ -342,12 +344,13 @@ impl Picture<'_> {
         if !(at.cmpge(first).all() && at.cmple(last).all()) {
             return false;
         }
-        let ray = self.ray(at);
-        let (lo, hi) = change.bounds;
-        // A pixel is as wide as this where it is farthest.
-        let far = (ray.origin - (lo + hi) / 2.0).length() + (hi - lo).length();
-        let width = far * self.camera.pixel();
-        ray.meets((lo - width, hi + width), f64::INFINITY)
+        change.changed.is_met(&self.ray(at), f64::INFINITY)
+    }
+
+    /// Edge of a pixel (voxels) where a box is farthest.
+    pub fn widest(&self, (lo, hi): (DVec3, DVec3)) -> f64 {
+        let eye = self.transform.world_to_index(self.camera.eye);
+        (eye.distance((lo + hi) / 2.0) + (hi - lo).length()) * self.camera.pixel()
     }
 
     /// The ray through a point of the picture, in index space.
