@@ -108,9 +108,9 @@ impl<'a> Cursor<'a> {
         let beyond = local.cmpeq(IVec3::splat(LEAF_DIM - 1)).bitmask() as usize;
         // The leaf of a corner is found once for all corners in it: mostly two.
         let mut leaves = [self.leaf; 8];
-        for side in 1..8 {
+        for (side, leaf) in leaves.iter_mut().enumerate().skip(1) {
             if side & !beyond == 0 {
-                leaves[side] = self.around(13 + (side & 1) * 9 + (side >> 1 & 1) * 3 + (side >> 2));
+                *leaf = self.around(13 + (side & 1) * 9 + (side >> 1 & 1) * 3 + (side >> 2));
             }
         }
         let mut corners = [0.0; 8];
