@@ -219,12 +219,14 @@ impl Report<'_> {
             whole("Euler number", |m| m.euler),
         ];
         text += &table::columns(heading.into_iter().chain(rows));
-        let changed = match voxels_changed {
-            0 => "no voxel changed".into(),
-            n => format!("{} voxels changed", table::count(*n)),
+        let changed = match (facts.before, voxels_changed) {
+            // Made of a mesh, or of nothing: all of it is new.
+            (None, _) => String::new(),
+            (Some(_), 0) => "no voxel changed; ".into(),
+            (Some(_), n) => format!("{} voxels changed; ", table::count(*n)),
         };
         text += &format!(
-            "  {changed}; {} active voxels of {} world units\n",
+            "  {changed}{} active voxels of {} world units\n",
             table::count(edit.level_set.grid().active_voxels()),
             table::number(edit.level_set.voxel_size())
         );
@@ -235,7 +237,7 @@ impl Report<'_> {
         }
         // Lists are for programs.
         for (name, value) in summary.details.iter().filter(|(_, value)| !value.is_array()) {
-            text += &format!("  {}: {value}\n", name.replace('_', " "));
+            text += &format!("  {}: {}\n", name.replace('_', " "), table::value(value));
         }
         text
     }

@@ -205,12 +205,15 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         options.camera.frame = Frame::Sphere;
     }
     let columns = matches.get_one::<u32>("columns").map_or(subjects.len(), |n| *n as usize);
+    let (mut width, mut height) = (options.width, options.height);
     for (path, turn) in &frames {
         let mut options = options.clone();
         options.camera.azimuth += turn;
         let images: Vec<Image> =
             subjects.iter().map(|subject| subject.draw(&options, &context.run)).collect::<Result<_>>()?;
-        write(path, &Image::sheet(&images, columns))?;
+        let sheet = Image::sheet(&images, columns);
+        (width, height) = (sheet.width, sheet.height);
+        write(path, &sheet)?;
     }
     let names: Vec<String> = frames.iter().map(|(path, _)| path.display().to_string()).collect();
     let seconds = began.elapsed().as_secs_f64();
@@ -218,16 +221,16 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
     value.insert("operation".into(), "render".into());
     value.insert("output".into(), names.first().cloned().into());
     value.insert("outputs".into(), names.clone().into());
-    value.insert("width".into(), options.width.into());
-    value.insert("height".into(), options.height.into());
+    value.insert("width".into(), width.into());
+    value.insert("height".into(), height.into());
     if let Some(components) = subjects.first().and_then(|subject| subject.components.as_ref()) {
         value.insert("components".into(), components.voxels().len().into());
     }
     value.insert("seconds".into(), seconds.into());
     value.insert("warnings".into(), warnings.into());
-    context.reporter.result(&value.into(), || {
-        format!("{}: {} x {} pixels in {seconds:.2} s\n", names.join(", "), options.width, options.height)
-    })
+    context
+        .reporter
+        .result(&value.into(), || format!("{}: {width} x {height} pixels in {seconds:.2} s\n", names.join(", ")))
 }
 
 impl Color {

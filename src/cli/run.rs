@@ -61,7 +61,7 @@ fn build(command: Command) -> Command {
                 .conflicts_with_all(["json", "dry-run"])
                 .help(
                     "Run again whenever the recipe or one of its input files changes, until cancelled: only the steps that the change affects; \
-                     pictures appear first, in a quarter of their resolution before the whole",
+                     pictures appear first, large changes in a quarter of the resolution before the whole",
                 ),
         )
         .arg(

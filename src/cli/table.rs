@@ -1,6 +1,7 @@
 //! Tables and numbers for people.
 
 use comfy_table::{CellAlignment, Table, presets};
+use serde_json::Value;
 
 /// Rows of words in aligned columns, indented; the first column is left-aligned, the others right-aligned.
 pub fn columns(rows: impl IntoIterator<Item = Vec<String>>) -> String {
@@ -40,6 +41,18 @@ pub fn number(value: f64) -> String {
     without_zeros(&text).to_owned()
 }
 
+/// What a program would be told.
+pub fn value(value: &Value) -> String {
+    match value {
+        Value::String(text) => text.clone(),
+        Value::Number(n) => match n.as_u64() {
+            Some(n) => count(n),
+            None => n.as_f64().map_or_else(|| n.to_string(), number),
+        },
+        value => value.to_string(),
+    }
+}
+
 fn without_zeros(text: &str) -> &str {
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { text }
 }
@@ -68,6 +81,8 @@ pub fn change(before: f64, after: f64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     #[test]
@@ -87,6 +102,10 @@ mod tests {
             assert_eq!(number(value), text);
         }
         assert_eq!([count(0), count(999), count(1000), count(1234567)], ["0", "999", "1,000", "1,234,567"]);
+        assert_eq!(
+            [json!(13764), json!(-3), json!(1.392665490040933), json!("a b")].map(|v| value(&v)),
+            ["13,764", "-3", "1.3927", "a b"]
+        );
         assert_eq!(change(2.0, 1.0), "-50.000 %");
         assert_eq!(change(0.0, 1.0), "");
     }

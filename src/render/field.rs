@@ -2,7 +2,7 @@
 
 use glam::{DVec3, IVec3};
 
-use crate::grid::{Grid, LEAF_DIM, LeafId, NeighbourTable, leaf_offset, leaf_origin};
+use crate::grid::{Grid, LEAF_DIM, LeafId, LeafValues, NeighbourTable, leaf_offset, leaf_origin};
 
 /// A level set's values with the tables that make neighbouring leaves cheap to read.
 pub(super) struct Field<'a> {
@@ -50,7 +50,8 @@ impl<'a> Field<'a> {
 
     /// A reader for one ray or pixel, which remembers the last leaf.
     pub fn cursor(&self) -> Cursor<'_> {
-        Cursor { field: self, origin: IVec3::ZERO, id: self.grid.find(IVec3::ZERO) }
+        let id = self.grid.find(IVec3::ZERO);
+        Cursor { field: self, origin: IVec3::ZERO, id, leaf: self.grid.values(id) }
     }
 }
 
@@ -59,27 +60,31 @@ pub(super) struct Cursor<'a> {
     field: &'a Field<'a>,
     origin: IVec3,
     id: LeafId,
+    leaf: &'a LeafValues,
 }
 
-impl Cursor<'_> {
+impl<'a> Cursor<'a> {
     #[inline(always)]
     fn enter(&mut self, ijk: IVec3) {
         let origin = leaf_origin(ijk);
         if origin != self.origin {
             self.origin = origin;
             self.id = self.field.grid.find(origin);
+            self.leaf = self.field.grid.values(self.id);
         }
     }
 
     /// The leaf `q` around the current one, numbered as in [`Neighbours`](crate::grid::Neighbours).
     #[inline(always)]
-    fn beside(&self, q: usize) -> LeafId {
-        if self.id.is_sentinel() {
+    fn around(&self, q: usize) -> &'a LeafValues {
+        let grid = self.field.grid;
+        let id = if self.id.is_sentinel() {
             let q = q as i32;
-            self.field.grid.find(self.origin + IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1) * LEAF_DIM)
+            grid.find(self.origin + IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1) * LEAF_DIM)
         } else {
             self.field.neighbours[self.id.index()][q]
-        }
+        };
+        grid.values(id)
     }
 
     /// φ (world units) at the corners of the cell with first corner `ijk`, in the order x·4 + y·2 + z.
@@ -88,9 +93,10 @@ impl Cursor<'_> {
         self.enter(ijk);
         let local = ijk - self.origin;
         if local.max_element() < LEAF_DIM - 1 {
-            let values = &self.field.grid.values(self.id).0[leaf_offset(ijk)..];
+            let values = &self.leaf.0[leaf_offset(ijk)..];
             // Within one leaf x is 64 apart, y 8, z 1.
-            [0, 1, 8, 9, 64, 65, 72, 73].map(|step| values[step])
+            let at = |step: usize| values[step];
+            [at(0), at(1), at(8), at(9), at(64), at(65), at(72), at(73)]
         } else {
             self.border_cell(local)
         }
@@ -98,20 +104,20 @@ impl Cursor<'_> {
 
     /// [`cell`](Self::cell) where a corner lies beyond the leaf.
     fn border_cell(&self, local: IVec3) -> [f32; 8] {
-        // The leaf of a corner is found once for all corners in it: mostly two.
+        // Bits x, y, z.
         let beyond = local.cmpeq(IVec3::splat(LEAF_DIM - 1)).bitmask() as usize;
-        let mut leaves = [self.id; 8];
+        // The leaf of a corner is found once for all corners in it: mostly two.
+        let mut leaves = [self.leaf; 8];
         for (side, leaf) in leaves.iter_mut().enumerate().skip(1) {
-            // Bits x, y, z as those of the mask.
             if side & !beyond == 0 {
-                *leaf = self.beside(13 + (side & 1) * 9 + (side >> 1 & 1) * 3 + (side >> 2));
+                *leaf = self.around(13 + (side & 1) * 9 + (side >> 1 & 1) * 3 + (side >> 2));
             }
         }
         let mut corners = [0.0; 8];
         for (c, corner) in corners.iter_mut().enumerate() {
             let at = local + IVec3::new(c as i32 >> 2, c as i32 >> 1 & 1, c as i32 & 1);
             let side = (c >> 2 | c & 2 | (c & 1) << 2) & beyond;
-            *corner = self.field.grid.values(leaves[side]).0[leaf_offset(at)];
+            *corner = leaves[side].0[leaf_offset(at)];
         }
         corners
     }
@@ -159,7 +165,7 @@ impl Cursor<'_> {
     #[inline(always)]
     fn taps(&self, first: IVec3) -> [f32; 64] {
         let mut taps = [0.0; 64];
-        let mut leaf = (usize::MAX, self.field.grid.values(self.id));
+        let mut leaf = (usize::MAX, self.leaf);
         for (row, taps) in (0..).zip(taps.chunks_exact_mut(4)) {
             let at = first + IVec3::new(row >> 2, row & 3, 0);
             for (z, tap) in (at.z..).zip(taps) {
@@ -168,7 +174,7 @@ impl Cursor<'_> {
                 let q = (13 + beside.x * 9 + beside.y * 3 + beside.z) as usize;
                 // Found once for all that lie in it, one after the other.
                 if q != leaf.0 {
-                    leaf = (q, self.field.grid.values(self.beside(q)));
+                    leaf = (q, self.around(q));
                 }
                 *tap = leaf.1.0[leaf_offset(voxel)];
             }

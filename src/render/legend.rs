@@ -1,7 +1,7 @@
 //! A bar of colours with the numbers at its ends, in a corner of a picture.
 
 use super::Image;
-use super::shade::encode;
+use super::shade::{display, quantize};
 use super::vertices::sequential;
 
 /// Rows of three pixels of 0..9 and the point.
@@ -29,7 +29,7 @@ pub(super) fn draw(image: &mut Image, low: f64, high: f64) {
     let (margin, length) = (4 * pixel, (f64::from(image.width) * BAR) as u32);
     let top = image.height.saturating_sub(margin + THICK * pixel);
     for x in 0..length {
-        let color = encode(sequential(f64::from(x) / f64::from(length.max(2) - 1)), 0.5);
+        let color = quantize(display(sequential(f64::from(x) / f64::from(length.max(2) - 1))), 0.5);
         for y in 0..THICK * pixel {
             set(image, margin + x, top + y, color);
         }

@@ -1,20 +1,20 @@
 //! Rays against the surface: the first zero of the trilinear field, solved exactly.
 //!
-//! Empty blocks are crossed at once ([`SkipMap`]). In blocks with surface a ray steps by 0.9 |φ| where that is more than a cell,
+//! Empty space is crossed in jumps ([`SkipMap`]). Where there is surface a ray steps by 0.9 |φ| where that is more than a cell,
 //! and from cell to cell otherwise. Along a ray the trilinear field of a cell is a cubic; its first root
 //! comes from the monotone pieces between its extremes (Marmitt et al. 2004), so that neighbouring pixels see one
 //! continuous surface, without steps. Distances along rays are in voxels.
 
-use glam::{DVec3, IVec3, Vec3};
+use glam::{DVec3, IVec3, Vec3, Vec3A};
 
 use super::field::{Cursor, Field};
-use super::skip::SkipMap;
+use super::skip::{self, SkipMap};
 
 /// Part of |φ| that a step takes: trilinear values may exceed the distance by a few hundredths of a voxel.
-const STEP: f64 = 0.9;
+const STEP: f32 = 0.9;
 /// Where all corners of a cell are farther from the surface (voxels), a step by |φ| may be longer than the cell.
-const HOP_FROM: f64 = 0.3;
-/// After a jump, rays go this far (voxels) into the next block, so that rounding cannot put them back.
+const HOP_FROM: f32 = 0.3;
+/// After a jump, rays go this far (voxels) into the next part, so that rounding cannot put them back.
 const NUDGE: f64 = 1e-7;
 /// Components of a direction below this are taken as 0.
 const PARALLEL: f64 = 1e-9;
@@ -24,7 +24,7 @@ const PARALLEL: f64 = 1e-9;
 pub(super) struct Ray {
     pub origin: DVec3,
     pub direction: DVec3,
-    inverse: DVec3,
+    pub inverse: DVec3,
 }
 
 impl Ray {
@@ -46,15 +46,9 @@ impl Ray {
         Self { origin: self.at(t), ..*self }
     }
 
-    /// Whether the ray passes through a box before `t_end`.
-    pub fn meets(&self, bounds: (DVec3, DVec3), t_end: f64) -> bool {
-        let (enter, leave) = self.crossing(bounds);
-        enter <= leave && leave >= 0.0 && enter <= t_end
-    }
-
     /// Entry and exit of a box.
     #[inline(always)]
-    fn crossing(&self, (lo, hi): (DVec3, DVec3)) -> (f64, f64) {
+    pub fn crossing(&self, (lo, hi): (DVec3, DVec3)) -> (f64, f64) {
         let (a, b) = ((lo - self.origin) * self.inverse, (hi - self.origin) * self.inverse);
         (a.min(b).max_element(), a.max(b).min_element())
     }
@@ -66,6 +60,12 @@ fn floor(p: DVec3) -> IVec3 {
     let toward_zero = p.as_ivec3();
     let above = p.cmplt(toward_zero.as_dvec3());
     toward_zero - IVec3::select(above, IVec3::ONE, IVec3::ZERO)
+}
+
+/// The same in single precision.
+#[inline(always)]
+fn floor_near(p: Vec3A) -> IVec3 {
+    p.floor().as_ivec3()
 }
 
 /// Where a ray starts.
@@ -89,73 +89,113 @@ impl Scene<'_> {
         let (enter, leave) = ray.crossing(self.skip.bounds());
         let mut t = enter.max(0.0);
         let t_end = leave.min(t_end);
-        let to_voxels = self.field.to_voxels();
-        let reach = (HOP_FROM / to_voxels) as f32;
         let mut outside = start == Start::Outside;
-        let step = ray.direction.map(|d| if d < 0.0 { -1.0 } else { 1.0 }).as_ivec3();
-        let ahead = step.max(IVec3::ZERO).as_dvec3();
         let mut nudge = NUDGE;
+        let octant = skip::octant(ray.direction);
         while t < t_end {
-            let mut cell = floor(ray.at(t));
-            let block = self.skip.block(cell);
-            if let Some(empty) = self.skip.empty_around(block) {
-                let beyond = ray.crossing(empty).1 + NUDGE;
-                // Rounding may leave a grazing ray in the same block: growing steps get it out.
+            let cell = floor(ray.at(t));
+            if let Some(far) = self.skip.empty_ahead(self.skip.part(cell), octant) {
+                let beyond = ((far - ray.origin) * ray.inverse).min_element() + NUDGE;
+                // Rounding may leave a grazing ray in the same part: growing steps get it out.
                 nudge = if beyond > t { NUDGE } else { 2.0 * nudge };
                 t = beyond.max(t + nudge);
                 continue;
             }
-            // Distances at which the ray leaves the cell through its next x, y and z face.
-            let mut faces = (cell.as_dvec3() + ahead - ray.origin) * ray.inverse;
-            while t < t_end && self.skip.block(cell) == block {
-                let corners = cursor.cell(cell);
-                let (low, high) = extremes(&corners);
-                let exit = faces.min_element();
-                if low < 0.0 && high >= 0.0 {
-                    let corners = corners.map(f64::from);
-                    let cubic = Cubic::along(&corners, ray.at(t) - cell.as_dvec3(), ray.direction);
-                    let length = (exit - t).max(0.0);
-                    if outside && cubic.at(0.0) <= 0.0 {
-                        return Some(t);
-                    }
-                    if let Some(s) = cubic.first_entry(length) {
-                        return (t + s < t_end).then_some(t + s);
-                    }
-                    outside = cubic.at(length) > 0.0;
-                } else if low < 0.0 {
-                    if outside {
-                        return Some(t);
-                    }
-                } else {
-                    outside = true;
-                }
-                if low > reach || high < -reach {
-                    let part = (ray.at(t) - cell.as_dvec3()).as_vec3();
-                    let hop = t + STEP * to_voxels * f64::from(interpolate(&corners, part).abs());
-                    if hop > exit {
-                        t = hop;
-                        cell = floor(ray.at(t));
-                        faces = (cell.as_dvec3() + ahead - ray.origin) * ray.inverse;
-                        continue;
-                    }
-                }
-                t = exit.max(t);
-                if faces.x <= exit {
-                    cell.x += step.x;
-                    faces.x += ray.inverse.x.abs();
-                } else if faces.y <= exit {
-                    cell.y += step.y;
-                    faces.y += ray.inverse.y.abs();
-                } else {
-                    cell.z += step.z;
-                    faces.z += ray.inverse.z.abs();
-                }
+            match self.walk(cursor, ray, t, cell, &mut outside) {
+                Walk::Hit(at) => return (at < t_end).then_some(at),
+                // Onto the cell that the walk has reached: its own corner may round to the other side of the face.
+                Walk::Left(at) => t = at + NUDGE,
             }
-            // Onto the cell that the walk has reached: its own corner may round to the other side of the face.
-            t += NUDGE;
         }
         None
     }
+
+    /// Whether a point is outside the surface.
+    pub fn is_outside(&self, cursor: &mut Cursor, point: DVec3) -> bool {
+        let cell = floor(point);
+        interpolate(&cursor.cell(cell), (point - cell.as_dvec3()).as_vec3()) > 0.0
+    }
+
+    /// The way of a ray through a part with surface from `cell` on, where it is at `t`.
+    #[inline(always)]
+    fn walk(&self, cursor: &mut Cursor, ray: &Ray, t: f64, mut cell: IVec3, outside: &mut bool) -> Walk {
+        let to_voxels = self.field.to_voxels() as f32;
+        let reach = HOP_FROM / to_voxels;
+        let part = self.skip.part(cell);
+        // From here on relative to the cell in which it enters and to t: single precision is plenty within a part.
+        let first = cell;
+        let origin = (ray.at(t) - first.as_dvec3()).as_vec3a();
+        let (direction, inverse) = (ray.direction.as_vec3a(), ray.inverse.as_vec3a());
+        let step = ray.direction.map(|d| if d < 0.0 { -1.0 } else { 1.0 }).as_ivec3();
+        let ahead = step.max(IVec3::ZERO).as_vec3a();
+        // Distances at which the ray leaves the cell through its next x, y and z face.
+        let faces_of = |cell: IVec3| ((cell - first).as_vec3a() + ahead - origin) * inverse;
+        let stride = inverse.abs();
+        let (mut s, mut faces) = (0.0f32, faces_of(cell));
+        loop {
+            let corners = cursor.cell(cell);
+            let (low, high) = extremes(&corners);
+            let exit = faces.min_element();
+            if low < 0.0 && high >= 0.0 {
+                let [a, b, c, d, e, f, g, h] = corners;
+                let corners = [a.into(), b.into(), c.into(), d.into(), e.into(), f.into(), g.into(), h.into()];
+                let at = t + f64::from(s);
+                let cubic = Cubic::along(&corners, ray.at(at) - cell.as_dvec3(), ray.direction);
+                let length = f64::from((exit - s).max(0.0));
+                if *outside && cubic.at(0.0) <= 0.0 {
+                    return Walk::Hit(at);
+                }
+                if cubic.is_positive(length) {
+                    *outside = true;
+                } else {
+                    if let Some(entry) = cubic.first_entry(length) {
+                        return Walk::Hit(at + entry);
+                    }
+                    *outside = cubic.at(length) > 0.0;
+                }
+            } else if low < 0.0 {
+                if *outside {
+                    return Walk::Hit(t + f64::from(s));
+                }
+            } else {
+                *outside = true;
+            }
+            let hop = if low > reach || high < -reach {
+                let at = origin + direction * s - (cell - first).as_vec3a();
+                s + STEP * to_voxels * interpolate(&corners, at.into()).abs()
+            } else {
+                0.0
+            };
+            if hop > exit {
+                s = hop;
+                cell = first + floor_near(origin + direction * s);
+                faces = faces_of(cell);
+            } else {
+                s = exit.max(s);
+                if faces.x <= exit {
+                    cell.x += step.x;
+                    faces.x += stride.x;
+                } else if faces.y <= exit {
+                    cell.y += step.y;
+                    faces.y += stride.y;
+                } else {
+                    cell.z += step.z;
+                    faces.z += stride.z;
+                }
+            }
+            if self.skip.part(cell) != part {
+                return Walk::Left(t + f64::from(s));
+            }
+        }
+    }
+}
+
+/// How a ray has passed a part with surface.
+enum Walk {
+    /// It went into the surface here.
+    Hit(f64),
+    /// It left the part here.
+    Left(f64),
 }
 
 /// The least and the largest of the corners. In pairs: the inner loop waits for it.
@@ -206,6 +246,14 @@ impl Cubic {
     fn at(&self, s: f64) -> f64 {
         let [c0, c1, c2, c3] = self.0;
         c0 + s * (c1 + s * (c2 + s * c3))
+    }
+
+    /// Whether the coefficients of the Bernstein form over 0..=length are positive, and so all values between.
+    #[inline(always)]
+    fn is_positive(&self, length: f64) -> bool {
+        let [c0, c1, c2, _] = self.0;
+        let (c1, c2) = (c1 * length, c2 * length * length);
+        c0 > 0.0 && 3.0 * c0 + c1 > 0.0 && 3.0 * c0 + 2.0 * c1 + c2 > 0.0 && self.at(length) > 0.0
     }
 
     /// The first s in 0..=length at which the field goes from positive to negative.

@@ -5,6 +5,7 @@
 //! point sees its unhidden part. The picture is the same, to the bit, for any number of threads.
 
 mod camera;
+mod change;
 mod field;
 mod legend;
 mod march;
@@ -217,12 +218,9 @@ fn prepare<'a>(
     let skip = SkipMap::new(level_set.grid());
     let extent = skip.as_ref().map_or(0.0, |s| (s.bounds().1 - s.bounds().0).max_element());
     let lights = Lights::around(&camera);
-    let light = Light {
-        key: transform.to_index().transform_vector3(lights.key).normalize(),
-        range: OCCLUSION_RANGE * extent,
-        sky_rays: options.occlusion_rays as usize,
-        key_rays: if options.shadow { SHADOW_RAYS } else { 0 },
-    };
+    let key = transform.to_index().transform_vector3(lights.key).normalize();
+    let key_rays = if options.shadow { SHADOW_RAYS } else { 0 };
+    let light = Light::new(key, OCCLUSION_RANGE * extent, options.occlusion_rays as usize, key_rays);
     let default_range = match color_by {
         ColorBy::Difference(_) => DIFFERENCE_RANGE,
         ColorBy::Distortion(_) => DISTORTION_RANGE,
@@ -243,8 +241,15 @@ fn prepare<'a>(
         antialias: options.antialias,
         width,
         height,
-        background: (!options.transparent_background).then(|| options.background.map(shade::decode)),
+        background: (!options.transparent_background).then(|| background(options)),
     })
+}
+
+/// Colours of the rows of the background, linear and as displayed.
+fn background(options: &RenderOptions) -> Vec<[DVec3; 2]> {
+    let [top, bottom] = options.background.map(shade::decode);
+    let row = |y| top.lerp(bottom, (f64::from(y) + 0.5) / f64::from(options.height));
+    (0..options.height).map(row).map(|linear| [linear, shade::display(linear)]).collect()
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@
 
 use glam::DVec3;
 
+use super::change::Changed;
 use super::field::Cursor;
 use super::march::{Ray, Scene, Start};
 
@@ -38,6 +39,10 @@ pub(super) struct Light {
     pub sky_rays: usize,
     /// Rays a pixel to the key light; none leaves it visible.
     pub key_rays: usize,
+    /// The directions to the sky of all classes, along the axes of a surface point: two tangents and the normal.
+    to_sky: Vec<DVec3>,
+    /// The directions to the key light of all classes.
+    to_key: Vec<DVec3>,
 }
 
 /// Visibility from a surface point with unit `normal` (index axes), with the rays of the pattern at pixel (x, y).
@@ -67,10 +72,9 @@ pub(super) fn visibility(
     } else if normal.dot(light.key) < -LIGHT_RADIUS {
         0.0
     } else {
-        let pair = light.key.any_orthonormal_pair();
         let mut seen = 0;
         for k in 0..light.key_rays {
-            let ray = light.to_key(origin, pair, k, class);
+            let ray = light.to_key(origin, k, class);
             seen += usize::from(scene.hit(cursor, &ray, Start::Surface, f64::INFINITY).is_none());
         }
         seen as f64 / light.key_rays as f64
@@ -78,14 +82,21 @@ pub(super) fn visibility(
     Visibility { sky, key }
 }
 
-/// Whether one of the rays of [`visibility`] passes through a box.
-pub(super) fn meets(light: &Light, (point, normal): (DVec3, DVec3), at: (i64, i64), bounds: (DVec3, DVec3)) -> bool {
+/// Whether one of the rays of [`visibility`] passes something that was changed.
+pub(super) fn meets(light: &Light, (point, normal): (DVec3, DVec3), at: (i64, i64), changed: &Changed) -> bool {
     let (origin, class) = (point + normal * LIFT, class_of(at));
+    // Most are decided by a ball around the box: too far or below the horizon for the sky, beside the cone towards the light.
+    let bounds = changed.bounds();
+    let (to, radius) = ((bounds.0 + bounds.1) / 2.0 - origin, (bounds.1 - bounds.0).length() / 2.0);
+    let distance = to.length();
+    let (along, reach) = (to.dot(light.key), light.range + radius);
+    let across = (distance * distance - along * along).max(0.0).sqrt();
+    let is_in_sky = distance <= reach && to.dot(normal) > -radius;
+    let is_to_key = along > -radius && across - radius <= (along + radius) * LIGHT_RADIUS;
     let pair = normal.any_orthonormal_pair();
-    let to_sky = |k| light.to_sky((origin, normal), pair, k, class).meets(bounds, light.range);
-    let pair = light.key.any_orthonormal_pair();
-    let to_key = |k| light.to_key(origin, pair, k, class).meets(bounds, f64::INFINITY);
-    (0..light.sky_rays).any(to_sky) || (0..light.key_rays).any(to_key)
+    let to_sky = |k| changed.is_met(&light.to_sky((origin, normal), pair, k, class), light.range);
+    let to_key = |k| changed.is_met(&light.to_key(origin, k, class), f64::INFINITY);
+    is_in_sky && (0..light.sky_rays).any(to_sky) || is_to_key && (0..light.key_rays).any(to_key)
 }
 
 /// The place of a pixel in the pattern.
@@ -95,18 +106,34 @@ fn class_of((x, y): (i64, i64)) -> usize {
 }
 
 impl Light {
-    /// A ray to the sky above a point with its normal and the directions across that.
-    fn to_sky(&self, (origin, normal): (DVec3, DVec3), (a, b): (DVec3, DVec3), k: usize, class: usize) -> Ray {
-        let [u, v] = set_point(k, self.sky_rays, class);
-        let (sin, cos) = (std::f64::consts::TAU * v).sin_cos();
-        Ray::new(origin, (a * cos + b * sin) * u.sqrt() + normal * (1.0 - u).sqrt())
+    /// With so many rays a pixel.
+    pub fn new(key: DVec3, range: f64, sky_rays: usize, key_rays: usize) -> Self {
+        let points = |count: usize| {
+            (0..PATTERN * PATTERN).flat_map(move |class| (0..count).map(move |k| set_point(k, count, class)))
+        };
+        let turn = |v: f64| (std::f64::consts::TAU * v).sin_cos();
+        let sky = |[u, v]: [f64; 2]| {
+            let (sin, cos) = turn(v);
+            DVec3::new(cos * u.sqrt(), sin * u.sqrt(), (1.0 - u).sqrt())
+        };
+        let (a, b) = key.any_orthonormal_pair();
+        let disc = |[u, v]: [f64; 2]| {
+            let (sin, cos) = turn(v);
+            (key + (a * cos + b * sin) * (u.sqrt() * LIGHT_RADIUS)).normalize()
+        };
+        let (to_sky, to_key) = (points(sky_rays).map(sky).collect(), points(key_rays).map(disc).collect());
+        Self { key, range, sky_rays, key_rays, to_sky, to_key }
     }
 
-    /// A ray to the key light, whose disc two directions span.
-    fn to_key(&self, origin: DVec3, (a, b): (DVec3, DVec3), k: usize, class: usize) -> Ray {
-        let [u, v] = set_point(k, self.key_rays, class);
-        let (sin, cos) = (std::f64::consts::TAU * v).sin_cos();
-        Ray::new(origin, (self.key + (a * cos + b * sin) * (u.sqrt() * LIGHT_RADIUS)).normalize())
+    /// A ray to the sky above a point with its normal and the directions across that.
+    fn to_sky(&self, (origin, normal): (DVec3, DVec3), (a, b): (DVec3, DVec3), k: usize, class: usize) -> Ray {
+        let along = self.to_sky[class * self.sky_rays + k];
+        Ray::new(origin, a * along.x + b * along.y + normal * along.z)
+    }
+
+    /// A ray to the key light.
+    fn to_key(&self, origin: DVec3, k: usize, class: usize) -> Ray {
+        Ray::new(origin, self.to_key[class * self.key_rays + k])
     }
 }
 
@@ -169,7 +196,7 @@ mod tests {
         let set = sphere(20.0, 3.0);
         let scene = scene(&set);
         let mut cursor = scene.field.cursor();
-        let light = Light { key: DVec3::Y, range: 30.0, sky_rays: 8, key_rays: 4 };
+        let light = Light::new(DVec3::Y, 30.0, 8, 4);
         for i in 0..64 {
             let a = f64::from(i) * 2.399963;
             let z = 1.0 - (f64::from(i) + 0.5) / 32.0;

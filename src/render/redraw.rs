@@ -1,19 +1,20 @@
 //! A picture drawn again after an edit: only those pixels of which a ray could find something else.
 //!
-//! What has changed lies in a box. A pixel keeps what it showed if neither its ray passes that box, nor one of the rays to the sky and to the key light
+//! What has changed lies in some cubes of space. A pixel keeps what it showed if neither its ray passes one of them, nor one of the rays to the sky and to the key light
 //! of the pixels that its light is the mean of, nor one of a neighbour's that its edges are smoothed with: every number that goes into it is the same. What belongs to
 //! the picture as a whole (camera, lights, extent) must be the same too, or everything is drawn.
 
 use std::mem::{Discriminant, discriminant};
 
-use glam::{DVec3, IVec3};
+use glam::{DVec2, DVec3, IVec3};
 use rayon::prelude::*;
 
 use super::camera::Camera;
+use super::change::Changed;
 use super::png::Image;
 use super::screen::Screen;
 use super::skip::SkipMap;
-use super::tile::{Before, Drawn, Picture};
+use super::tile::{Change, Drawn, Picture};
 use super::{ColorBy, OPERATION, RenderOptions, prepare, render};
 use crate::error::Result;
 use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafId};
@@ -22,6 +23,10 @@ use crate::run::RunOptions;
 
 /// Pixels of the picture along the side of one of the coarse picture.
 const COARSE: u32 = 4;
+/// How far away (voxels) values may be that a normal is made of.
+const TAPS: f64 = 2.0;
+/// Part of the picture that an edit may cover without a coarse picture: the whole one is as soon there.
+const LOCAL: f64 = 0.125;
 
 /// The last picture of a view, from which the next one takes what has not changed.
 #[derive(Default)]
@@ -44,8 +49,8 @@ struct Last {
 }
 
 impl Redraw {
-    /// As [`render`](super::render), to the bit. Where anything is to be drawn, `coarse` is given a picture of a quarter of the resolution first,
-    /// enlarged to the size of the whole.
+    /// As [`render`](super::render), to the bit. Where more than an eighth of the picture may change, `coarse` is given a picture of a quarter of the
+    /// resolution first, enlarged to the size of the whole.
     pub fn render(
         &mut self,
         level_set: &LevelSet,
@@ -58,7 +63,14 @@ impl Redraw {
         let corners = picture.corners();
         let last = self.last.take().filter(|last| last.is_of(&picture, level_set, color_by, options));
         let changed = last.as_ref().map(|last| last.changed(&picture, level_set.grid()));
-        if changed != Some(None) {
+        let pixels =
+            changed.as_ref().map(|changed| changed.as_ref().map(|changed| picture.pixels_of(changed.bounds())));
+        let is_local = |(lo, hi): (DVec2, DVec2)| {
+            let size = DVec2::new(options.width.into(), options.height.into());
+            let shown = (hi.min(size) - lo.max(DVec2::ZERO)).max(DVec2::ZERO);
+            shown.element_product() <= LOCAL * size.element_product()
+        };
+        if pixels.is_none_or(|pixels| pixels.is_some_and(|pixels| !is_local(pixels))) {
             let small = RenderOptions {
                 width: options.width.div_ceil(COARSE),
                 height: options.height.div_ceil(COARSE),
@@ -67,29 +79,29 @@ impl Redraw {
             };
             coarse(&render(level_set, color_by, &small, run)?.enlarged(COARSE, options.width, options.height))?;
         }
-        let tiles = match (last, changed) {
+        let (mut old, screen) = last.map_or((Vec::new(), None), |last| (last.tiles, Some(last.screen)));
+        let is_same = pixels == Some(None);
+        let change = match (&screen, changed.flatten(), pixels.flatten()) {
+            (Some(screen), Some(changed), Some(pixels)) => Some(Change { screen, changed, pixels }),
+            _ => None,
+        };
+        let tiles = if is_same {
             // Nothing that can be seen has changed.
-            (Some(mut last), Some(None)) => {
-                last.tiles.iter_mut().for_each(|tile| tile.fresh = 0);
-                last.tiles
-            }
-            (last, changed) => {
-                let changed = changed.flatten();
-                let before = |n: usize| {
-                    let (last, changed) = (last.as_ref()?, changed?);
-                    Some(Before { tile: last.tiles.get(n)?, screen: &last.screen, changed })
-                };
-                let task = run.task(OPERATION, corners.len() as u64);
-                let draw = |(n, corner): (usize, &(u32, u32))| {
-                    if run.is_cancelled() {
-                        return Drawn::default();
-                    }
-                    let tile = picture.tile(*corner, before(n));
-                    task.advance(1);
-                    tile
-                };
-                corners.par_iter().enumerate().map(draw).collect::<Vec<Drawn>>()
-            }
+            old.iter_mut().for_each(|tile| tile.fresh = 0);
+            old
+        } else {
+            let task = run.task(OPERATION, corners.len() as u64);
+            let mut old: Vec<Option<Drawn>> = old.into_iter().map(Some).collect();
+            old.resize_with(corners.len(), || None);
+            let draw = |(corner, old): ((u32, u32), Option<Drawn>)| {
+                if run.is_cancelled() {
+                    return Drawn::default();
+                }
+                let tile = picture.tile(corner, old.zip(change.as_ref()));
+                task.advance(1);
+                tile
+            };
+            corners.into_par_iter().zip(old).map(draw).collect::<Vec<Drawn>>()
         };
         run.check(OPERATION)?;
         self.drawn = tiles.iter().map(|tile| tile.fresh).sum();
@@ -142,18 +154,18 @@ impl Last {
             && picture.scene.as_ref().is_some_and(|scene| scene.skip.is_congruent(&self.skip))
     }
 
-    /// The box in which rays could find something else, in index space; none if there is nothing. A normal takes values of the leaves around the one in
-    /// which it is. How far the surface is from a block without it does not count, since it only says in how many jumps a ray gets there: it enters a block
-    /// with surface at its face, wherever it came from.
-    fn changed(&self, picture: &Picture<'_>, grid: &Grid) -> Option<(DVec3, DVec3)> {
+    /// Where rays could find something else; none if there is nothing. A normal takes values up to two voxels away. How far the surface is from a block
+    /// without it does not count, since it only says in how many jumps a ray gets there: it enters a part with surface at its face, wherever it
+    /// came from.
+    fn changed(&self, picture: &Picture<'_>, grid: &Grid) -> Option<Changed> {
         let old = self.level_set.grid();
-        let blocks = picture.scene.iter().flat_map(|scene| scene.skip.changed(&self.skip));
+        let parts = picture.scene.iter().flat_map(|scene| scene.skip.changed(&self.skip));
         let gone = old.leaves().iter().map(|id| old.origin(*id)).filter(|origin| grid.find(*origin).is_sentinel());
         let (neighbours, neighbours_before) = (grid.neighbours(), old.neighbours());
         let differs = |id: LeafId| {
             let before = old.find(grid.origin(id));
             if before.is_sentinel() {
-                return true;
+                return Some(0);
             }
             // Leaves that come or go beside it count for themselves.
             let beside = neighbours[id.index()].iter().zip(&neighbours_before[before.index()]);
@@ -161,12 +173,17 @@ impl Last {
             let bits = |grid: &Grid, id: LeafId, at: usize| grid.values(id).0[at].to_bits();
             let same = || (0..LEAF_VOXELS).all(|at| bits(grid, id, at) == bits(old, before, at));
             let is_shared = before == id && grid.shares_storage(old, id);
-            !(is_shared || same()) || beside.into_iter().any(turned)
+            if beside.into_iter().any(turned) {
+                return Some(LEAF_DIM);
+            }
+            (!(is_shared || same())).then_some(0)
         };
-        let other = grid.map_leaves(|id| differs(id).then(|| grid.origin(id)));
-        let around = |origin: IVec3| ((origin - LEAF_DIM).as_dvec3(), (origin + 2 * LEAF_DIM).as_dvec3());
-        let leaves = gone.chain(other.into_iter().flatten()).map(around);
-        blocks.chain(leaves).reduce(|(a, b), (c, d)| (a.min(c), b.max(d)))
+        let other = grid.map_leaves(|id| differs(id).map(|margin| (grid.origin(id), margin)));
+        let leaf = |(lo, margin): (IVec3, i32)| ((lo - margin).as_dvec3(), (lo + LEAF_DIM + margin).as_dvec3());
+        let leaves = gone.map(|origin| (origin, 0)).chain(other.into_iter().flatten()).map(leaf);
+        let boxes: Vec<(DVec3, DVec3)> = parts.chain(leaves).collect();
+        let all = boxes.iter().copied().reduce(|(a, b), (c, d)| (a.min(c), b.max(d)))?;
+        Changed::of(&boxes, TAPS + picture.widest(all))
     }
 }
 

@@ -1,61 +1,83 @@
-//! Where in the picture the surface may be, and how near: the blocks of the skip map drawn as boxes.
+//! Where in the picture the surface may be, and how near: the parts of the skip map's blocks drawn as boxes.
 //!
-//! Most rays of a picture meet nothing, or empty space for most of their way. A block's box covers what its projected corners span, and is no nearer than the ball
+//! Most rays of a picture meet nothing, or empty space for most of their way. A box covers what its projected corners span, and is no nearer than the ball
 //! around it; so a ray may begin at the least of these distances over its pixel, and where there is none, it meets nothing.
 
+use std::ops::Range;
+
 use glam::{DVec2, DVec3};
+use rayon::prelude::*;
 
 use super::camera::Camera;
 use super::skip::SkipMap;
 use crate::grid::Transform;
 
-/// For each pixel, how far from the eye (voxels) the first block with surface is at least; infinite where there is none.
+/// Edge in pixels of the squares of which one distance is known.
+const SQUARE: usize = 2;
+/// Rows of squares that a thread draws at a time.
+const BAND: usize = 32;
+
+/// For each square of pixels, how far from the eye (voxels) the first block with surface is at least; infinite where there is none.
 pub(super) struct Screen {
-    width: usize,
-    height: usize,
+    size: DVec2,
+    columns: usize,
     nearest: Vec<f32>,
+}
+
+/// What a box covers, in squares: columns and rows, and how near it is.
+struct Shadow {
+    columns: Range<usize>,
+    rows: Range<usize>,
+    distance: f32,
 }
 
 impl Screen {
     /// Of a picture.
     pub fn new(skip: &SkipMap, camera: &Camera, transform: &Transform, width: u32, height: u32) -> Self {
-        let (width, height) = (width as usize, height as usize);
-        let mut screen = Self { width, height, nearest: vec![f32::INFINITY; width * height] };
-        for (lo, hi) in skip.blocks() {
+        let [columns, rows] = [width, height].map(|n| (n as usize).div_ceil(SQUARE));
+        let size = DVec2::new(width.into(), height.into());
+        let eye = transform.world_to_index(camera.eye);
+        let shadow = |(lo, hi): (DVec3, DVec3)| {
             let (mut first, mut last) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
             for corner in 0..8 {
                 let pick = |bit: i32| f64::from(corner >> bit & 1);
                 let at = lo + (hi - lo) * DVec3::new(pick(2), pick(1), pick(0));
-                let Some(pixel) = camera.pixel_of(transform.index_to_world(at)) else {
-                    // Beside or behind the eye: anything may be anywhere.
-                    screen.nearest.fill(0.0);
-                    return screen;
-                };
+                let pixel = camera.pixel_of(transform.index_to_world(at))?;
                 (first, last) = (first.min(pixel), last.max(pixel));
             }
-            let eye = transform.world_to_index(camera.eye);
             let distance = ((lo + hi) / 2.0).distance(eye) - (hi - lo).length() / 2.0;
-            screen.draw(first, last, (distance - 1.0).max(0.0) as f32);
+            // A square is drawn from its pixels' corners, give or take a rounding.
+            let side = |low: f64, high: f64, count: usize| {
+                let square = |at: f64| (at / SQUARE as f64).clamp(0.0, count as f64) as usize;
+                square(low - 0.01)..square(high + 0.01 + SQUARE as f64)
+            };
+            let (columns, rows) = (side(first.x, last.x, columns), side(first.y, last.y, rows));
+            Some(Shadow { columns, rows, distance: (distance - 1.0).max(0.0) as f32 })
+        };
+        let parts: Vec<_> = skip.with_surface().collect();
+        let shadows: Option<Vec<Shadow>> = parts.into_par_iter().map(shadow).collect();
+        let mut nearest = vec![f32::INFINITY; columns * rows];
+        match shadows {
+            Some(shadows) => nearest.par_chunks_mut(BAND * columns.max(1)).enumerate().for_each(|(n, band)| {
+                let top = n * BAND;
+                for Shadow { columns: across, rows, distance } in &shadows {
+                    for row in rows.start.max(top)..rows.end.min(top + BAND) {
+                        let row = &mut band[(row - top) * columns..][..columns];
+                        row[across.clone()].iter_mut().for_each(|nearest| *nearest = nearest.min(*distance));
+                    }
+                }
+            }),
+            // Beside or behind the eye: anything may be anywhere.
+            None => nearest.fill(0.0),
         }
-        screen
-    }
-
-    /// A rectangle with its rim.
-    fn draw(&mut self, first: DVec2, last: DVec2, distance: f32) {
-        let side = |at: f64, size: usize| at.clamp(0.0, size as f64) as usize;
-        let (left, right) = (side(first.x - 1.0, self.width), side(last.x + 2.0, self.width));
-        let (top, bottom) = (side(first.y - 1.0, self.height), side(last.y + 2.0, self.height));
-        for y in top..bottom {
-            for nearest in &mut self.nearest[y * self.width + left..y * self.width + right.max(left)] {
-                *nearest = nearest.min(distance);
-            }
-        }
+        Self { size, columns, nearest }
     }
 
     /// How far from the eye a ray through a point of the picture may begin. Beyond the picture nothing is known.
     pub fn start(&self, at: DVec2) -> f64 {
-        let within = at.cmpge(DVec2::ZERO).all() && at.x < self.width as f64 && at.y < self.height as f64;
-        if within { self.nearest[at.y as usize * self.width + at.x as usize].into() } else { 0.0 }
+        let within = at.cmpge(DVec2::ZERO).all() && at.cmplt(self.size).all();
+        let [column, row] = at.to_array().map(|at| at as usize / SQUARE);
+        if within { self.nearest[row * self.columns + column].into() } else { 0.0 }
     }
 }
 

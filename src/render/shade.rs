@@ -1,6 +1,6 @@
 //! Light, material and tone: from a surface point to a colour.
 //!
-//! All colours are linear sRGB until [`encode`]. The lights stand relative to the camera, so every view is lit alike: a
+//! All colours are linear sRGB until [`display`]. The lights stand relative to the camera, so every view is lit alike: a
 //! large key light from the upper left, a weak one at the camera that keeps shadows readable, a rim light from behind,
 //! and a sky that is brighter above than below. Creases show because the sky's part is weighed by how much of it is seen.
 
@@ -89,14 +89,16 @@ pub(super) fn decode(srgb: [u8; 3]) -> DVec3 {
     to_linear(DVec3::from_array(srgb.map(f64::from)) / 255.0)
 }
 
-/// 8-bit sRGB from linear 0..1. `dither` (0..1) decides which of the two nearest values is taken: smooth gradients keep
-/// no bands.
-pub(super) fn encode(linear: DVec3, dither: f64) -> [u8; 3] {
-    let srgb = linear
-        .clamp(DVec3::ZERO, DVec3::ONE)
-        .map(|c| if c <= 0.003_130_8 { c * 12.92 } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 });
+/// sRGB, 0..255, from linear 0..1.
+pub(super) fn display(linear: DVec3) -> DVec3 {
+    let linear = linear.clamp(DVec3::ZERO, DVec3::ONE);
+    linear.map(|c| if c <= 0.003_130_8 { c * 12.92 } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 }) * 255.0
+}
+
+/// 8 bits from 0..255. `dither` (0..1) decides which of the two nearest values is taken: smooth gradients keep no bands.
+pub(super) fn quantize(srgb: DVec3, dither: f64) -> [u8; 3] {
     // Within a hair of a whole number there is nothing to dither: white stays white.
-    srgb.to_array().map(|c| (c * 255.0 + 0.02 + 0.96 * dither).floor().min(255.0) as u8)
+    srgb.to_array().map(|c| (c + 0.02 + 0.96 * dither) as u8)
 }
 
 /// Interleaved gradient noise (Jimenez 2014): even within every 3×3 pixels, the same for every run.
@@ -126,6 +128,10 @@ pub(super) fn label(n: u32) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn encode(linear: DVec3, dither: f64) -> [u8; 3] {
+        quantize(display(linear), dither)
+    }
 
     #[test]
     fn srgb_round_trips_and_dithering_keeps_whole_values() {

@@ -1,48 +1,55 @@
 //! Where a ray may meet the surface at all: a coarse map of empty space.
 //!
-//! The space around the leaves is divided into cubic blocks: single leaves, or larger ones when those would be too many.
-//! Every block knows how many blocks away (in the maximum norm) the nearest one is that holds a sign change, so a ray
-//! crosses empty space, outside and inside, in a few jumps.
+//! The space around the leaves is divided into cubic blocks: single leaves, or larger ones when those would be too many, each of eight
+//! parts. Every block knows, for each of the eight octants of directions, how large a cube that begins with it holds no change of sign, so a ray
+//! crosses empty space, outside and inside, in a few jumps; a block with surface knows which of its parts hold some.
 
 use glam::{DVec3, IVec3};
+use rayon::prelude::*;
 
-use crate::grid::{Grid, LeafId};
-use crate::stencil::Halo;
+use crate::grid::{Grid, LeafId, leaf_origin};
+use crate::stencil::{Halo, Row};
 
-/// Most blocks in the map: 2 MiB, built in about 50 ms. A larger object gets larger blocks.
-const MAX_BLOCKS: u64 = 1 << 21;
+/// Most blocks in the map: 2.3 MB. A larger object gets larger blocks.
+const MAX_BLOCKS: u64 = 1 << 18;
+/// log2 of the least edge of a part in voxels: half of a leaf's.
+const LEAST_SHIFT: u32 = 2;
+const LEAST_EDGE: i32 = 1 << LEAST_SHIFT;
 
-/// Distances to the nearest block with surface, in blocks.
+/// Where the surface is.
 pub(super) struct SkipMap {
     /// First block, in blocks.
     lo: IVec3,
     size: IVec3,
-    /// log2 of a block's edge in voxels.
+    /// log2 of a part's edge in voxels; a block's is twice that.
     shift: u32,
-    distance: Vec<u8>,
+    /// A bit for each part of a block with surface, in the order x·4 + y·2 + z.
+    parts: Vec<u8>,
+    /// Edge in blocks of the empty cube that a block is the first of, by octant.
+    ahead: [Vec<u8>; 8],
 }
 
 impl SkipMap {
     /// The map of a grid; `None` when no cell of it changes sign.
     pub fn new(grid: &Grid) -> Option<Self> {
-        let mut marked: Vec<IVec3> =
-            grid.map_leaves(|id| leaves_with_surface(grid, id)).into_iter().flatten().collect();
+        let mut marked: Vec<IVec3> = grid.map_leaves(|id| parts_with_surface(grid, id)).into_iter().flatten().collect();
         marked.extend(bare_faces(grid));
         let lo = marked.iter().copied().reduce(IVec3::min)?;
         let hi = marked.iter().copied().reduce(IVec3::max)?;
-        let mut shift = 3;
-        let size_at = |shift: u32| (hi >> shift) - (lo >> shift) + 1;
+        let mut shift = LEAST_SHIFT;
+        let size_at = |shift: u32| (hi >> (shift + 1)) - (lo >> (shift + 1)) + 1;
         while size_at(shift).to_array().iter().map(|&n| n as u64).product::<u64>() > MAX_BLOCKS {
             shift += 1;
         }
         let size = size_at(shift);
-        let mut map = Self { lo: lo >> shift, size, shift, distance: Vec::new() };
-        map.distance = vec![u8::MAX; (size.x * size.y * size.z) as usize];
-        for origin in marked {
-            let at = map.index((origin >> shift) - map.lo);
-            map.distance[at] = 0;
+        let mut map = Self { lo: lo >> (shift + 1), size, shift, parts: Vec::new(), ahead: Default::default() };
+        map.parts = vec![0; (size.x * size.y * size.z) as usize];
+        for first in marked {
+            let part = first >> shift;
+            let at = map.index((part >> 1) - map.lo);
+            map.parts[at] |= 1 << place(part);
         }
-        map.spread();
+        map.ahead = (0..8).into_par_iter().map(|octant| map.cubes(octant)).collect::<Vec<_>>().try_into().ok()?;
         Some(map)
     }
 
@@ -50,60 +57,70 @@ impl SkipMap {
         ((local.x * self.size.y + local.y) * self.size.z + local.z) as usize
     }
 
-    /// Two passes over all blocks, each looking at the 13 neighbours that the pass has seen: exact in the maximum norm.
-    fn spread(&mut self) {
-        let before: Vec<IVec3> = (0..13).map(|q| IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1)).collect();
-        let count = self.distance.len();
-        for backwards in [false, true] {
-            for i in 0..count {
-                let at = if backwards { count - 1 - i } else { i };
-                let mut best = self.distance[at];
-                if best == 0 {
-                    continue;
-                }
-                let flat = at as i32;
-                let local = IVec3::new(
-                    flat / (self.size.y * self.size.z),
-                    flat / self.size.z % self.size.y,
-                    flat % self.size.z,
-                );
-                for &step in &before {
-                    let beside = if backwards { local - step } else { local + step };
-                    if beside.cmpge(IVec3::ZERO).all() && beside.cmplt(self.size).all() {
-                        best = best.min(self.distance[self.index(beside)].saturating_add(1));
+    /// The empty cubes towards an octant: one block larger than the least of those that begin with the seven next blocks. Beyond the map
+    /// all is empty.
+    fn cubes(&self, octant: usize) -> Vec<u8> {
+        let mut edges = vec![0u8; self.parts.len()];
+        let step = towards(octant);
+        let along = |n: i32, step: i32| (0..n).map(move |i| if step > 0 { n - 1 - i } else { i });
+        for x in along(self.size.x, step.x) {
+            for y in along(self.size.y, step.y) {
+                for z in along(self.size.z, step.z) {
+                    let local = IVec3::new(x, y, z);
+                    let at = self.index(local);
+                    if self.parts[at] != 0 {
+                        continue;
                     }
+                    let next = (1..8).map(|n| local + step * IVec3::new(n >> 2, n >> 1 & 1, n & 1));
+                    let within = next.filter(|next| next.cmpge(IVec3::ZERO).all() && next.cmplt(self.size).all());
+                    let least = within.map(|next| edges[self.index(next)]).min().unwrap_or(u8::MAX);
+                    edges[at] = least.saturating_add(1);
                 }
-                self.distance[at] = best;
             }
         }
+        edges
     }
 
     /// The box of all blocks with surface, in index space.
     pub fn bounds(&self) -> (DVec3, DVec3) {
-        let edge = f64::from(1u32 << self.shift);
+        let edge = self.edge();
         (self.lo.as_dvec3() * edge, (self.lo + self.size).as_dvec3() * edge)
     }
 
-    /// The boxes of the blocks that may hold surface, in index space.
-    pub fn blocks(&self) -> impl Iterator<Item = (DVec3, DVec3)> + '_ {
-        (0..self.distance.len()).filter(|n| self.distance[*n] == 0).map(|n| self.block_at(n))
+    /// Edge of a block in voxels.
+    fn edge(&self) -> f64 {
+        f64::from(2u32 << self.shift)
     }
 
-    /// The block of a cell.
+    /// The boxes of the parts that may hold surface, in index space.
+    pub fn with_surface(&self) -> impl Iterator<Item = (DVec3, DVec3)> + '_ {
+        let parts = move |n: usize| (0..8).filter(move |place| self.parts[n] >> place & 1 == 1);
+        (0..self.parts.len()).flat_map(move |n| parts(n).map(move |place| self.part_at(n, place)))
+    }
+
+    /// The part in which a cell is, in parts.
     #[inline(always)]
-    pub fn block(&self, cell: IVec3) -> IVec3 {
+    pub fn part(&self, cell: IVec3) -> IVec3 {
         cell >> self.shift
     }
 
-    /// The box around a block that holds no surface, in index space: `None` if the block itself may hold some.
+    /// Where an empty cube ends towards an octant that begins with the block of a part, or with the part: its far corner in index space. `None`
+    /// if the part may hold surface.
     #[inline(always)]
-    pub fn empty_around(&self, block: IVec3) -> Option<(DVec3, DVec3)> {
-        let distance = i32::from(self.distance[self.index((block - self.lo).clamp(IVec3::ZERO, self.size - 1))]);
-        if distance == 0 {
-            return None;
+    pub fn empty_ahead(&self, part: IVec3, octant: usize) -> Option<DVec3> {
+        let block: IVec3 = part >> 1;
+        let at = self.index((block - self.lo).clamp(IVec3::ZERO, self.size - 1));
+        let edge = i32::from(self.ahead[octant][at]);
+        let step = towards(octant);
+        // The far side of what begins at `first` and is `edge` long.
+        let far = |first: IVec3, edge: i32| {
+            first + step * edge + IVec3::select(step.cmplt(IVec3::ZERO), IVec3::ONE, IVec3::ZERO)
+        };
+        match edge {
+            0 if self.parts[at] >> place(part) & 1 == 1 => None,
+            0 => Some(far(part, 1).as_dvec3() * (0.5 * self.edge())),
+            edge => Some(far(block, edge).as_dvec3() * self.edge()),
         }
-        let edge = f64::from(1u32 << self.shift);
-        Some(((block - (distance - 1)).as_dvec3() * edge, (block + distance).as_dvec3() * edge))
     }
 
     /// Whether both maps have the same blocks.
@@ -111,68 +128,95 @@ impl SkipMap {
         (self.lo, self.size, self.shift) == (other.lo, other.size, other.shift)
     }
 
-    /// The boxes of the blocks that hold surface in one of two maps with the same blocks, and not in the other.
+    /// The boxes of the parts that hold surface in one of two maps with the same blocks, and not in the other.
     pub fn changed<'a>(&'a self, before: &'a Self) -> impl Iterator<Item = (DVec3, DVec3)> + 'a {
-        let changed = move |n: &usize| (self.distance[*n] == 0) != (before.distance[*n] == 0);
-        (0..self.distance.len()).filter(changed).map(|n| self.block_at(n))
+        let parts = move |n: usize| (0..8).filter(move |place| (self.parts[n] ^ before.parts[n]) >> place & 1 == 1);
+        (0..self.parts.len()).flat_map(move |n| parts(n).map(move |place| self.part_at(n, place)))
     }
 
-    /// The box of a block by its place.
-    fn block_at(&self, n: usize) -> (DVec3, DVec3) {
-        let (n, row, edge) = (n as i32, self.size.z, f64::from(1u32 << self.shift));
-        let lo = (self.lo + IVec3::new(n / (self.size.y * row), n / row % self.size.y, n % row)).as_dvec3() * edge;
-        (lo, lo + edge)
+    /// The box of a part by its block and its place there.
+    fn part_at(&self, n: usize, place: i32) -> (DVec3, DVec3) {
+        let (n, row) = (n as i32, self.size.z);
+        let block = self.lo + IVec3::new(n / (self.size.y * row), n / row % self.size.y, n % row);
+        let lo = (block * 2 + IVec3::new(place >> 2, place >> 1 & 1, place & 1)).as_dvec3() * (0.5 * self.edge());
+        (lo, lo + 0.5 * self.edge())
     }
 
     /// Bytes of the map.
-    pub const MAX_BYTES: u64 = MAX_BLOCKS;
+    pub const MAX_BYTES: u64 = MAX_BLOCKS * 9;
 }
 
-/// Origins of the leaves (`id` and those below it along the axes) that have a cell with a corner in `id` and a change of sign.
-fn leaves_with_surface(grid: &Grid, id: LeafId) -> Vec<IVec3> {
+/// The place of a part in its block.
+#[inline(always)]
+fn place(part: IVec3) -> i32 {
+    let bits = part & 1;
+    bits.x << 2 | bits.y << 1 | bits.z
+}
+
+/// The octant of a direction: a bit for x, y and z that is set where it does not fall.
+pub(super) fn octant(direction: DVec3) -> usize {
+    let rises = direction.cmpge(DVec3::ZERO);
+    usize::from(rises.x) << 2 | usize::from(rises.y) << 1 | usize::from(rises.z)
+}
+
+/// The diagonal of an octant.
+#[inline(always)]
+fn towards(octant: usize) -> IVec3 {
+    let side = |bit: usize| (octant >> bit & 1) as i32 * 2 - 1;
+    IVec3::new(side(2), side(1), side(0))
+}
+
+/// First voxels of the least parts (of leaf `id`, and of absent leaves below it along the axes) that have a cell with a corner in `id` and a change
+/// of sign: a cell belongs to the part of its first corner.
+fn parts_with_surface(grid: &Grid, id: LeafId) -> Vec<IVec3> {
     let mut halo = Halo::new();
-    halo.gather(grid.value_pages(), &grid.neighbours()[id.index()]);
-    // The first cells begin one voxel below the leaf: a cell belongs to the leaf of its first corner.
-    let mixed = |below: IVec3| {
-        let span = |b: i32| if b == 0 { 0..=8 } else { -1..=0 };
-        // Voxels −1 and 0 along z, or 0 to 7 and then 8.
-        let runs: &[(isize, usize, usize)] = if below.z == 0 { &[(0, 0, 8), (1, 7, 8)] } else { &[(-1, 0, 2)] };
-        let (mut negative, mut positive) = (false, false);
-        for x in span(below.x) {
-            for y in span(below.y) {
-                for &(dz, from, to) in runs {
-                    for value in &halo.row(0, 0, [x as isize, y as isize, dz])[from..to] {
-                        negative |= *value < 0.0;
-                        positive |= *value >= 0.0;
-                    }
-                }
-            }
+    let around = &grid.neighbours()[id.index()];
+    halo.gather(grid.value_pages(), around);
+    // By x and y from −1 on: a bit for each z from −1 on at which φ is negative.
+    let mut negative = [[0u16; 10]; 10];
+    let is_negative = |row: &Row| row.iter().rev().fold(0, |bits, value| bits << 1 | u16::from(*value < 0.0));
+    for (x, slab) in negative.iter_mut().enumerate() {
+        for (y, bits) in slab.iter_mut().enumerate() {
+            let row = |dz: isize| is_negative(halo.row(0, 0, [x as isize - 1, y as isize - 1, dz]));
+            *bits = row(-1) | (row(1) & 0xC0) << 2;
         }
-        negative && positive
-    };
-    (0..8)
-        .map(|c| IVec3::new(-(c >> 2), -(c >> 1 & 1), -(c & 1)))
-        .filter(|below| mixed(*below))
-        .map(|below| grid.origin(id) + below * 8)
-        .collect()
+    }
+    // 0 along an axis is the last cell of the leaf below, 1 and 2 are the halves of this one.
+    let voxels = |part: usize| [0..2, 1..6, 5..10][part].clone();
+    let mut parts = Vec::new();
+    for n in 0..27 {
+        let part = [n / 9, n / 3 % 3, n % 3];
+        let beside = part.map(|part| usize::from(part != 0));
+        if !around[beside[0] * 9 + beside[1] * 3 + beside[2]].is_sentinel() && beside != [1; 3] {
+            continue;
+        }
+        let mask = voxels(part[2]).fold(0, |mask, z| mask | 1u16 << z);
+        let rows = negative[voxels(part[0])].iter().flat_map(|slab| &slab[voxels(part[1])]);
+        let (any, all) = rows.fold((0, mask), |(any, all), bits| (any | bits & mask, all & bits));
+        if any != 0 && all != mask {
+            let first = IVec3::from_array(part.map(|part| (part as i32 - 1) * LEAST_EDGE));
+            parts.push(grid.origin(id) + first);
+        }
+    }
+    parts
 }
 
-/// Leaf-sized blocks at which absent space changes sign without any leaf between, as a level set that lost its band has.
+/// First voxels of the least parts at which absent space changes sign without any leaf between, as a level set that lost its band has.
 fn bare_faces(grid: &Grid) -> Vec<IVec3> {
     let mut out = Vec::new();
     for (lo, edge) in grid.inside_tiles() {
-        for a in (0..edge).step_by(8) {
-            for b in (0..edge).step_by(8) {
+        for a in (0..edge).step_by(LEAST_EDGE as usize) {
+            for b in (0..edge).step_by(LEAST_EDGE as usize) {
                 for axis in 0..3 {
                     let mut at = [0; 3];
                     at[(axis + 1) % 3] = a;
                     at[(axis + 2) % 3] = b;
-                    for (own, beyond) in [(0, -8), (edge - 8, edge)] {
+                    for (own, beyond) in [(0, -LEAST_EDGE), (edge - LEAST_EDGE, edge)] {
                         at[axis] = own;
                         let inside = lo + IVec3::from_array(at);
                         at[axis] = beyond;
                         let outside = lo + IVec3::from_array(at);
-                        if grid.find(outside) == LeafId::OUTSIDE {
+                        if grid.find(leaf_origin(outside)) == LeafId::OUTSIDE {
                             out.extend([inside, outside]);
                         }
                     }
@@ -189,28 +233,40 @@ mod tests {
     use crate::render::testing::{scene, shape};
 
     #[test]
-    fn empty_boxes_hold_no_change_of_sign_and_are_as_large_as_they_can_be() {
+    fn empty_cubes_hold_no_change_of_sign_and_are_as_large_as_they_can_be() {
         let set = shape(crate::grid::Transform::uniform(1.0), 3.0, 80, |p| {
             (p.length() - 30.0).min((p - DVec3::new(60.0, -20.0, 33.0)).length() - 9.0)
         });
         let map = scene(&set).skip;
-        let blocks = |lo: IVec3, hi: IVec3| {
+        let all = |lo: IVec3, hi: IVec3| {
             (lo.x..hi.x)
                 .flat_map(move |x| (lo.y..hi.y).flat_map(move |y| (lo.z..hi.z).map(move |z| IVec3::new(x, y, z))))
         };
-        let changes = |block: IVec3| {
-            let mut signs = blocks(block * 8, block * 8 + 9).map(|v| set.grid().voxel(v).0 < 0.0);
-            let first = signs.next();
-            signs.any(|s| Some(s) != first)
+        let changes = |first: IVec3, edge: i32| {
+            let mut signs = all(first, first + edge + 1).map(|v| set.grid().voxel(v).0 < 0.0);
+            let sign = signs.next();
+            signs.any(|s| Some(s) != sign)
         };
         let (lo, hi) = (map.lo, map.lo + map.size);
-        let with_surface: Vec<IVec3> = blocks(lo, hi).filter(|b| changes(*b)).collect();
+        let with_surface: Vec<IVec3> = all(lo, hi).filter(|block| changes(*block * 8, 8)).collect();
         assert!(with_surface.len() > 100);
-        for block in blocks(lo, hi) {
-            let truth = with_surface.iter().map(|s| (*s - block).abs().max_element()).min().unwrap_or(0);
-            let expected =
-                (truth > 0).then(|| ((block - (truth - 1)).as_dvec3() * 8.0, (block + truth).as_dvec3() * 8.0));
-            assert_eq!(map.empty_around(block), expected, "{block}");
+        for (n, block) in all(lo, hi).enumerate() {
+            let octant = n % 8;
+            let step = towards(octant);
+            // How many blocks ahead those with surface are that are ahead along all axes.
+            let ahead = with_surface.iter().map(|s| (*s - block) * step);
+            let truth = ahead.filter(|a| a.cmpge(IVec3::ZERO).all()).map(|a| a.max_element()).min();
+            let corner = |first: IVec3, edge: i32| first + (step * (2 * edge - 1) + 1) / 2;
+            for part in all(block * 2, block * 2 + 2) {
+                let found = map.empty_ahead(part, octant);
+                match truth {
+                    Some(0) if changes(part * 4, 4) => assert_eq!(found, None),
+                    Some(0) => assert_eq!(found, Some((corner(part, 1) * 4).as_dvec3())),
+                    Some(edge) => assert_eq!(found, Some((corner(block, edge) * 8).as_dvec3())),
+                    // As far as the map goes, at least.
+                    None => assert!(map.ahead[octant][map.index(block - lo)] == u8::MAX),
+                }
+            }
         }
     }
 }

@@ -3,9 +3,10 @@
 //! Every pixel is computed from its own coordinates, and a tile looks at a rim of pixels around it, so the picture does not
 //! depend on how it is cut into tiles or which thread takes which.
 
-use glam::{DVec2, DVec3, DVec4};
+use glam::{DVec2, DVec3, DVec4, IVec3};
 
 use super::camera::Camera;
+use super::change::Changed;
 use super::field::Cursor;
 use super::march::{Ray, Scene, Start};
 use super::occlusion::{self, FilterPoint, Light, REACH, Visibility, filter_weight};
@@ -24,6 +25,9 @@ const COLOR_EDGE: f64 = 0.06;
 /// Cosine between the normals of neighbours below which there is an edge.
 const NORMAL_EDGE: f64 = 0.96;
 
+/// So many voxels before the nearest of its neighbours the rays of a pixel with an edge begin.
+const MARGIN: f64 = 3.0;
+
 /// All that the tiles share.
 pub(super) struct Picture<'a> {
     pub scene: Option<Scene<'a>>,
@@ -40,8 +44,8 @@ pub(super) struct Picture<'a> {
     pub antialias: u32,
     pub width: u32,
     pub height: u32,
-    /// Linear colour at the top and bottom; none is transparent.
-    pub background: Option<[DVec3; 2]>,
+    /// Colour of each row, linear and as displayed; none is transparent.
+    pub background: Option<Vec<[DVec3; 2]>>,
 }
 
 /// A surface point that a ray met.
@@ -80,12 +84,18 @@ impl Drawn {
     }
 }
 
-/// The tile before something in a box (index space) was changed, with where its rays began.
-#[derive(Clone, Copy)]
-pub(super) struct Before<'a> {
-    pub tile: &'a Drawn,
+/// What was changed since the last picture, and the rectangle of pixels that may show it. Where its rays began.
+pub(super) struct Change<'a> {
     pub screen: &'a Screen,
-    pub changed: (DVec3, DVec3),
+    pub changed: Changed,
+    pub pixels: (DVec2, DVec2),
+}
+
+/// The tile before that.
+#[derive(Clone, Copy)]
+struct Before<'a> {
+    tile: &'a Drawn,
+    change: &'a Change<'a>,
 }
 
 /// Readers of one tile.
@@ -120,6 +130,24 @@ enum Edge {
     Crease,
     /// The surface.
     Outline,
+}
+
+impl Edge {
+    fn between(a: &Option<Hit>, b: &Option<Hit>) -> Self {
+        match (a, b) {
+            (None, None) => Self::None,
+            (Some(a), Some(b)) => {
+                let is_off_plane = (b.point.position - a.point.position).dot(a.point.normal).abs() > 1.5 * a.footprint;
+                let is_bent = a.normal.dot(b.normal) < NORMAL_EDGE;
+                match is_off_plane {
+                    true => Self::Outline,
+                    false if is_bent || (a.albedo - b.albedo).abs().max_element() > COLOR_EDGE => Self::Crease,
+                    false => Self::None,
+                }
+            }
+            _ => Self::Outline,
+        }
+    }
 }
 
 /// Pixels of a tile with its rim.
@@ -178,7 +206,7 @@ impl Picture<'_> {
 
     /// The tile whose first pixel is (x0, y0), row by row, cut at the picture's border. What no ray can have found changed is taken
     /// from the tile before.
-    pub fn tile(&self, (x0, y0): (u32, u32), before: Option<Before<'_>>) -> Drawn {
+    pub fn tile(&self, (x0, y0): (u32, u32), before: Option<(Drawn, &Change<'_>)>) -> Drawn {
         let (width, height) = (TILE.min(self.width - x0), TILE.min(self.height - y0));
         let Some(scene) = &self.scene else {
             let background = |y| (x0..x0 + width).flat_map(move |x| self.encode(x, y, DVec4::ZERO));
@@ -193,6 +221,19 @@ impl Picture<'_> {
             rim,
         };
         let lit = |x: i64, y: i64| x.rem_euclid(spacing) == 0 && y.rem_euclid(spacing) == 0;
+        let place = |x: i64, y: i64| (x.div_euclid(spacing), y.div_euclid(spacing));
+        let point = |hit: &Hit| (hit.point.position, hit.point.normal);
+        if let Some((tile, change)) = &before {
+            let shown = tile.hits.iter().zip(window.pixels(rim));
+            let mut shown =
+                shown.filter_map(|(hit, (x, y, _))| hit.as_ref().filter(|_| lit(x, y)).map(|hit| (hit, place(x, y))));
+            let is_touched = || window.pixels(rim).any(|(x, y, _)| self.is_touched(pixel(x, y) + 0.5, change));
+            let meets = |(hit, at): (&Hit, _)| occlusion::meets(&self.light, point(hit), at, &change.changed);
+            if !tile.alone.contains(&true) && !is_touched() && !shown.any(meets) {
+                return before.map(|(tile, _)| Drawn { fresh: 0, ..tile }).unwrap_or_default();
+            }
+        }
+        let before = before.as_ref().map(|(tile, change)| Before { tile, change });
         let mut readers = Readers {
             cursor: scene.field.cursor(),
             other: match self.color_by {
@@ -211,22 +252,21 @@ impl Picture<'_> {
         let (mut touched, mut fresh) = (vec![false; count], vec![false; count]);
         let mut find = |(x, y, i): (i64, i64, usize)| {
             let at = pixel(x, y) + centre;
-            touched[i] = before.is_none_or(|before| self.is_touched(at, &before));
+            touched[i] = before.is_none_or(|before| self.is_touched(at, before.change));
             let old = || before.and_then(|before| before.tile.hits.get(i).copied().flatten());
-            hits[i] = if touched[i] { self.cast(scene, &mut readers, at) } else { old() };
+            hits[i] = if touched[i] { self.cast(scene, &mut readers, at, None) } else { old() };
             fresh[i] = touched[i] && (before.is_none() || hits[i] != old());
         };
         window.pixels(rim).filter(|(x, y, _)| lit(*x, *y)).for_each(&mut find);
         window.pixels(1).filter(|(x, y, _)| !lit(*x, *y)).for_each(&mut find);
-        let place = |x: i64, y: i64| (x.div_euclid(spacing), y.div_euclid(spacing));
-        let point = |hit: &Hit| (hit.point.position, hit.point.normal);
         let mut visibility = |hit: &Hit, (x, y): (i64, i64)| {
             occlusion::visibility(scene, &mut readers.cursor, &self.light, point(hit), place(x, y))
         };
         let mut raw = vec![Visibility::default(); count];
         for (x, y, i) in window.pixels(rim).filter(|(x, y, _)| lit(*x, *y)) {
             let Some(hit) = &hits[i] else { continue };
-            let meets = |before: &Before| occlusion::meets(&self.light, point(hit), place(x, y), before.changed);
+            let meets =
+                |before: &Before| occlusion::meets(&self.light, point(hit), place(x, y), &before.change.changed);
             let old = before.filter(|before| !fresh[i] && !meets(before)).and_then(|b| b.tile.raw.get(i).copied());
             raw[i] = old.unwrap_or_else(|| visibility(hit, (x, y)));
             fresh[i] |= old.is_none() && before.is_none_or(|b| b.tile.raw.get(i) != Some(&raw[i]));
@@ -281,18 +321,36 @@ impl Picture<'_> {
         Drawn { rgba8, hits, raw, seen, alone, fresh: drawn }
     }
 
+    /// The rectangle of pixels that may show something in a box.
+    pub fn pixels_of(&self, (lo, hi): (DVec3, DVec3)) -> (DVec2, DVec2) {
+        let corner = |c: i32| lo + (hi - lo) * IVec3::new(c >> 2, c >> 1 & 1, c & 1).as_dvec3();
+        let pixels = (0..8).map(|c| self.camera.pixel_of(self.transform.index_to_world(corner(c))));
+        let around = |(a, b): (DVec2, DVec2), at: DVec2| (a.min(at), b.max(at));
+        let all = pixels.collect::<Option<Vec<DVec2>>>();
+        // Beside or behind the eye: anywhere.
+        all.map_or((DVec2::NEG_INFINITY, DVec2::INFINITY), |all| {
+            let (lo, hi) = all.into_iter().fold((DVec2::INFINITY, DVec2::NEG_INFINITY), around);
+            (lo - 2.0, hi + 2.0)
+        })
+    }
+
     /// Whether a ray through the pixel around a point can find something else than before: it passes what was changed, or begins elsewhere.
-    fn is_touched(&self, at: DVec2, before: &Before<'_>) -> bool {
+    fn is_touched(&self, at: DVec2, change: &Change<'_>) -> bool {
         let begin = |screen: &Screen| screen.start(at);
-        if self.screen.as_ref().map(begin) != Some(begin(before.screen)) {
+        let (first, last) = change.pixels;
+        if self.screen.as_ref().map(begin) != Some(begin(change.screen)) {
             return true;
         }
-        let ray = self.ray(at);
-        let (lo, hi) = before.changed;
-        // A pixel is as wide as this where it is farthest.
-        let far = (ray.origin - (lo + hi) / 2.0).length() + (hi - lo).length();
-        let width = far * self.camera.pixel();
-        ray.meets((lo - width, hi + width), f64::INFINITY)
+        if !(at.cmpge(first).all() && at.cmple(last).all()) {
+            return false;
+        }
+        change.changed.is_met(&self.ray(at), f64::INFINITY)
+    }
+
+    /// Edge of a pixel (voxels) where a box is farthest.
+    pub fn widest(&self, (lo, hi): (DVec3, DVec3)) -> f64 {
+        let eye = self.transform.world_to_index(self.camera.eye);
+        (eye.distance((lo + hi) / 2.0) + (hi - lo).length()) * self.camera.pixel()
     }
 
     /// The ray through a point of the picture, in index space.
@@ -305,13 +363,19 @@ impl Picture<'_> {
         )
     }
 
-    /// What a ray through a point of the picture meets.
-    fn cast(&self, scene: &Scene<'_>, readers: &mut Readers<'_>, at: DVec2) -> Option<Hit> {
-        let direction = self.camera.direction(at.x, at.y);
-        let ray = self.ray(at);
-        let start = self.screen.as_ref().map_or(0.0, |screen| screen.start(at));
+    /// What a ray through a point of the picture meets; it begins `near` the surface if that is outside.
+    fn cast(&self, scene: &Scene<'_>, readers: &mut Readers<'_>, at: DVec2, near: Option<f64>) -> Option<Hit> {
+        let mut start = self.screen.as_ref().map_or(0.0, |screen| screen.start(at));
         if start.is_infinite() {
             return None;
+        }
+        let direction = self.camera.direction(at.x, at.y);
+        let ray = self.ray(at);
+        if let Some(near) = near
+            && near > start
+            && scene.is_outside(&mut readers.cursor, ray.at(near))
+        {
+            start = near;
         }
         let t = start + scene.hit(&mut readers.cursor, &ray.after(start), Start::Outside, f64::INFINITY)?;
         let position = ray.at(t);
@@ -379,17 +443,10 @@ impl Picture<'_> {
         let centre = &hits[window.index(x, y)];
         let mut edge = Edge::None;
         for (dx, dy) in (0..9).map(|k| (k % 3 - 1, k / 3 - 1)) {
-            match (centre, &hits[window.index(x + dx, y + dy)]) {
-                (None, None) => {}
-                (Some(a), Some(b)) => {
-                    if (b.point.position - a.point.position).dot(a.point.normal).abs() > 1.5 * a.footprint {
-                        return Edge::Outline;
-                    }
-                    if a.normal.dot(b.normal) < NORMAL_EDGE || (a.albedo - b.albedo).abs().max_element() > COLOR_EDGE {
-                        edge = Edge::Crease;
-                    }
-                }
-                _ => return Edge::Outline,
+            match Edge::between(centre, &hits[window.index(x + dx, y + dy)]) {
+                Edge::None => {}
+                Edge::Crease => edge = Edge::Crease,
+                Edge::Outline => return Edge::Outline,
             }
         }
         edge
@@ -405,12 +462,31 @@ impl Picture<'_> {
         n: u32,
     ) -> (DVec4, bool) {
         let (mut sum, mut alone) = (DVec4::ZERO, false);
-        for k in 0..n * n {
-            // Rows and columns sheared against each other, so that upright and level edges get n² steps, not n.
-            let (i, j) = (f64::from(k % n), f64::from(k / n));
-            let side = f64::from(n);
-            let offset = DVec2::new(i + (j + 0.5) / side, j + (i + 0.5) / side) / side;
-            if let Some(hit) = self.cast(scene, readers, pixel(x, y) + offset) {
+        // What is nearer than any neighbour would be thinner than a pixel, and no voxel is.
+        let beside = (0..9).filter_map(|k| hits[window.index(x + k % 3 - 1, y + k / 3 - 1)].as_ref());
+        let (near, least) = beside.fold((f64::INFINITY, f64::INFINITY), |(near, least), hit| {
+            (near.min(hit.footprint / self.camera.pixel()), least.min(hit.footprint))
+        });
+        let near = (least < 1.0).then_some(near - MARGIN);
+        let centre = &hits[window.index(x, y)];
+        // The corners of the grid first: where they and the centre show one surface, they are enough.
+        let is_corner = |k: u32| [k % n, k / n].iter().all(|at| *at == 0 || *at == n - 1);
+        let (corners, others): (Vec<u32>, Vec<u32>) = (0..n * n).partition(|k| is_corner(*k));
+        let mut has_outline = false;
+        let mut count = 0;
+        for samples in [corners, others] {
+            if count > 0 && !has_outline {
+                break;
+            }
+            count += samples.len();
+            for k in samples {
+                // Rows and columns sheared against each other, so that upright and level edges get n² steps, not n.
+                let (i, j) = (f64::from(k % n), f64::from(k / n));
+                let side = f64::from(n);
+                let offset = DVec2::new(i + (j + 0.5) / side, j + (i + 0.5) / side) / side;
+                let hit = self.cast(scene, readers, pixel(x, y) + offset, near);
+                has_outline |= Edge::between(centre, &hit) == Edge::Outline;
+                let Some(hit) = hit else { continue };
                 let beside = Around { at: (x, y), reach: 1, spacing: 1, border: 2 };
                 let visibility = self.mean(window, hits, seen, &hit, &beside).unwrap_or_else(|| {
                     alone = true;
@@ -421,7 +497,7 @@ impl Picture<'_> {
                 sum += self.color(&hit, visibility).extend(1.0);
             }
         }
-        (sum / f64::from(n * n), alone)
+        (sum / count as f64, alone)
     }
 
     /// Displayed colour of a surface point, linear.
@@ -437,15 +513,16 @@ impl Picture<'_> {
     fn encode(&self, x: u32, y: u32, color: DVec4) -> [u8; 4] {
         let alpha = color.w.clamp(0.0, 1.0);
         let dither = shade::dither(x, y);
-        match self.background {
-            Some([top, bottom]) => {
-                let part = (f64::from(y) + 0.5) / f64::from(self.height);
-                let [r, g, b] = shade::encode(color.truncate() + top.lerp(bottom, part) * (1.0 - alpha), dither);
+        match self.background.as_ref().map(|rows| rows[y as usize]) {
+            Some([behind, shown]) => {
+                let shown =
+                    if alpha == 0.0 { shown } else { shade::display(color.truncate() + behind * (1.0 - alpha)) };
+                let [r, g, b] = shade::quantize(shown, dither);
                 [r, g, b, u8::MAX]
             }
             None if alpha == 0.0 => [0; 4],
             None => {
-                let [r, g, b] = shade::encode(color.truncate() / alpha, dither);
+                let [r, g, b] = shade::quantize(shade::display(color.truncate() / alpha), dither);
                 [r, g, b, (alpha * 255.0).round() as u8]
             }
         }
