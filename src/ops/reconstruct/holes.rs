@@ -4,7 +4,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use super::forces::{Term, View};
+use super::term::{Term, View};
 use crate::levelset::UnionFind;
 use crate::mesh::{TriangleMesh, linear_from_srgb8};
 

@@ -24,11 +24,14 @@ mod first;
 mod fit;
 mod forces;
 mod holes;
+mod measured;
+mod term;
 
 use std::path::Path;
 use std::sync::Arc;
 
 use glam::{DVec3, IVec3};
+use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -36,13 +39,14 @@ use serde_json::json;
 use super::{Arity, Operator, Outcome, Summary, VoxelLength, WorldLength};
 use crate::error::{EditError, Result};
 use crate::grid::Transform;
-use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet};
-use crate::mesh::{Rebuild, TriangleMesh, level_set_of_mesh, rebuild};
+use crate::levelset::{DEFAULT_HALF_WIDTH, LevelSet, background};
+use crate::mesh::{Rebuild, TriangleMesh, level_set_to_mesh, rebuild};
 use crate::pde::{Moment, move_surface};
 use crate::range::{RangeMap, RangeSet};
 use crate::run::RunOptions;
-use first::without_specks;
-use forces::{Forces, Term};
+use forces::Forces;
+use measured::Measurements;
+use term::Term;
 
 const NAME: &str = "reconstruct";
 
@@ -195,7 +199,7 @@ pub fn reconstruct(set: RangeSet, params: &Reconstruct, run: &RunOptions) -> Res
         None => (bounds.1 - bounds.0).max_element() / params.resolution,
     };
     let transform = Transform::uniform(voxel_size);
-    let estimated: Vec<Option<f64>> = maps.iter().map(RangeMap::estimated_noise).collect();
+    let estimated: Vec<Option<f64>> = maps.par_iter().map(RangeMap::estimated_noise).collect();
     let noises: Vec<f64> = maps
         .iter()
         .zip(&estimated)
@@ -305,9 +309,10 @@ fn follow(
     params: &Reconstruct,
     run: &RunOptions,
 ) -> Result<Followed> {
-    let mut forces = Forces::new(terms, transform, run);
-    let first = forces.first_surface(params.half_width, bounds, run)?;
-    forces.check()?;
+    let half_width = background(params.half_width, &transform).into();
+    let mut measurements = Measurements::new(terms, transform, half_width, run);
+    let first = measurements.first_surface(params.half_width, bounds, run)?;
+    measurements.check()?;
     let nothing = || {
         let accepted = "a size of which what was measured is a few voxels thick";
         EditError::parameter(NAME, "voxel_size", transform.voxel_size(), accepted)
@@ -315,14 +320,15 @@ fn follow(
     if first.is_empty() {
         return Err(nothing());
     }
-    let (mesh, mut dropped) = without_specks(&first, params.least_part, run)?;
-    drop(first);
+    let (first, mut dropped) = first.without_specks(params.least_part, run)?;
     // Where rays graze the surface, the mean of D is no distance.
-    let mut surface = level_set_of_mesh(mesh, &transform, params.half_width, run)?;
+    let mut surface = rebuild(&first, &Rebuild::band(params.half_width), run)?;
+    drop(first);
+    let forces = Forces::new(&measurements);
     let voxel_size = transform.voxel_size();
     let (mut before, mut reason) = (f64::INFINITY, "all steps were taken");
     let mut control = |moment: &Moment| {
-        if forces.has_failed() {
+        if measurements.has_failed() {
             return None;
         }
         if moment.time >= LONGEST {
@@ -342,14 +348,12 @@ fn follow(
     let bending = params.beta * voxel_size * voxel_size;
     let report =
         move_surface(&mut surface, &forces, bending, RESTING * voxel_size, params.iterations, &mut control, run)?;
-    forces.check()?;
-    // Exact distances: those of the flow are too steep where it sharpens edges.
-    let (mesh, gone) = without_specks(&surface, params.least_part, run)?;
+    measurements.check()?;
+    let (surface, gone) = surface.without_specks(params.least_part, run)?;
     dropped += gone;
-    let surface = match gone {
-        0 => rebuild(&surface, &Rebuild::band(params.half_width), run)?,
-        _ => level_set_of_mesh(mesh.clone(), &transform, params.half_width, run)?,
-    };
+    let mesh = level_set_to_mesh(&surface, 0.0, run)?;
+    // Exact distances: those of the flow are too steep where it sharpens edges.
+    let surface = rebuild(&surface, &Rebuild::band(params.half_width), run)?;
     if surface.is_empty() {
         return Err(nothing());
     }
