@@ -49,11 +49,6 @@ const WORTH_A_PART: f64 = 0.8;
 pub trait SurfaceSpeed: Sync {
     /// Writes F (world units a unit of time, positive outwards) of the voxels of a leaf, and sums up what is wanted of the surface there.
     fn of_leaf(&self, leaf: &LeafSurface<'_>, speed: &mut LeafValues) -> Tally;
-
-    /// Whether F may be other than 0 in the leaf whose first voxel is `origin`; where not, the surface is not looked for.
-    fn acts_on(&self, _origin: IVec3, _background: f32) -> bool {
-        true
-    }
 }
 
 /// Sums over the surface, of what a speed measures there.
@@ -287,11 +282,6 @@ impl Motion for Moving<'_> {
                     let (origin, background) = (grid.origin(id), grid.background());
                     let speed = &mut speed[PageLeaves::slot(id)];
                     let moved = if limit.is_some() { rest.moved(grid, id) } else { 0.0 };
-                    if !source.acts_on(origin, background) {
-                        speed.0.fill(0.0);
-                        found.push(OfLeaf { id, origin, tally: Tally::default(), fastest: 0.0, moved });
-                        return;
-                    }
                     dispatch(Feet { tracker, id, moving, halo: &mut halo, normal: &mut normal, depth: &mut depth });
                     let leaf = LeafSurface { origin, background, moving, normal: &normal, depth: &depth };
                     let tally = source.of_leaf(&leaf, speed);

@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
-use glam::{DVec3, IVec3};
+use glam::DVec3;
 
 use super::measured::{Measured, Measurements};
 use super::term::{CUT, Local, RAMP, Rays, Term, window};
@@ -41,7 +41,7 @@ impl<'a> Forces<'a> {
 impl SurfaceSpeed for Forces<'_> {
     fn of_leaf(&self, leaf: &LeafSurface<'_>, speed: &mut LeafValues) -> Tally {
         let mut tally = Tally::default();
-        let measured = self.measurements.of(leaf.origin).filter(|_| !self.measurements.has_failed());
+        let measured = self.measurements.of(leaf.origin).filter(|measured| !measured.maps.is_empty());
         let Some(measured) = measured else {
             speed.0.fill(0.0);
             return tally;
@@ -55,10 +55,6 @@ impl SurfaceSpeed for Forces<'_> {
             tally.squares += f64::from(speed.0[at]) * f64::from(speed.0[at]);
         }
         tally
-    }
-
-    fn acts_on(&self, origin: IVec3, _: f32) -> bool {
-        self.measurements.of(origin).is_some_and(|measured| !measured.maps.is_empty())
     }
 }
 
@@ -113,27 +109,26 @@ impl Work for Push<'_> {
                 }
                 let n = [normal!(0), normal!(1), normal!(2)];
                 let depth = Lanes::from_slice(simd, &leaf.depths().0[at..at + 16]) * voxel_size;
-                let depths = depth.abs();
                 // How far from a voxel its ray meets the surface at most.
-                let farthest = (0..16).map(|k| depths[k]).fold(0.0, f32::max) * (1.0 / RAMP) as f32;
+                let farthest = depth.abs() * splat(simd, 1.0 / RAMP);
                 let (mut force, mut stiffness) = (zero, zero);
                 for (head, row) in measured.pair(at / 16) {
                     let map = &maps[head.map as usize];
-                    if head.nearest - farthest >= map.cut {
+                    if farthest.simd_gt(head.nearest - map.cut).to_bitmask() == 0 {
                         continue;
                     }
-                    // −n·l times a length, and that length.
-                    let (facing, length) = match map.rays {
+                    // −n·l times a length, and the square of that length.
+                    let (facing, squared) = match map.rays {
                         Rays::Parallel([x, y, z]) => (-(n[0] * x + n[1] * y + n[2] * z), one),
                         Rays::From([x, y, z]) => {
                             let [x, y, z] = [p[0] - x, p[1] - y, p[2] - z];
-                            let squared = (x * x + y * y + z * z).max(Lanes::splat(simd, f32::MIN_POSITIVE));
-                            (-(n[0] * x + n[1] * y + n[2] * z), squared.sqrt())
+                            (-(n[0] * x + n[1] * y + n[2] * z), x * x + y * y + z * z)
                         }
                     };
                     if facing.simd_gt(zero).to_bitmask() == 0 {
                         continue;
                     }
+                    let length = squared.max(Lanes::splat(simd, f32::MIN_POSITIVE)).sqrt();
                     let distance = Lanes::from_slice(simd, &row.distance.map(f32::from)) * map.units[0];
                     let weight = Lanes::from_slice(simd, &row.weight.map(f32::from)) * map.units[1];
                     // V is −n·l over RAMP, but at most 1: it has this denominator as well.
