@@ -1,7 +1,7 @@
 # The two commands that do all the set-up on a fresh Debian or Ubuntu machine with cargo:
 #   make demo    build, then an editing session on the models in assets/; results in out/
 #   make test    the whole test suite
-.PHONY: help setup demo gallery pages test bench nightly sanitize deny blender ci clean
+.PHONY: help setup demo gallery pages test bench nightly sanitize fuzz deny blender ci clean
 .DEFAULT_GOAL := help
 
 CARGO ?= cargo
@@ -16,6 +16,7 @@ help:
 	@echo 'make bench    kernels, every operator beside OpenVDB, cost and memory by size'
 	@echo 'make nightly  the test suite in release mode with the slow tests, and without OpenVDB'
 	@echo 'make sanitize the bridge to OpenVDB under valgrind and GCC'"'"'s UndefinedBehaviorSanitizer'
+	@echo 'make fuzz     the parsers on input guided by coverage, ten minutes each (cargo-fuzz, nightly compiler)'
 	@echo 'make deny     licences, origins and known faults of what is linked, by cargo-deny'
 	@echo 'make blender  open a level set of this tool in Blender (downloads 374 MB once)'
 	@echo 'make ci       everything that .ci/run checks'
@@ -48,6 +49,9 @@ nightly: setup
 
 sanitize: setup
 	@scripts/sanitize.sh
+
+fuzz:
+	@scripts/fuzz.sh
 
 deny:
 	@scripts/deny.sh

@@ -6,8 +6,8 @@
 //! al. 2002); it is the direction square to their normals.
 //!
 //! Gradients are differences to the side along each axis on which the field bends less (as in ENO schemes), so that they do not mix both sides.
-//! What is found counts only if it is consistent: unit gradients, planes that meet, an angle of 40° or more between two of them. So surfaces with radii
-//! of 2.5 voxels or more have no edges (their normals turn by √3 h/R within a cell), and noise has few.
+//! What is found counts only if it is consistent: unit gradients, planes that meet, an angle of 30° or more between two of them. So surfaces with radii
+//! of 3.3 voxels or more have no edges (their normals turn by √3 h/R within a cell), and noise has few.
 
 use glam::{DMat3, DVec3, IVec3, Vec3};
 
@@ -17,17 +17,21 @@ use crate::grid::Accessor;
 /// Differences of the field along parallel edges of a cell are apart by this where a sharp edge may pass, in voxels.
 const BENT: f32 = 0.2;
 
+/// Or the square of their mean is below this: where an edge crosses parallel edges of the cell alike, none differs from the others, but
+/// gradients cancel. At a surface with a radius of 3 voxels it is above 0.95.
+const SHORT: f32 = 0.93;
+
 /// How far a gradient may be from 1.
-const UNEVEN: f64 = 0.1;
+const UNEVEN: f64 = 0.15;
 
 /// How far from each of the planes the point may lie where they meet, in voxels.
-const APART: f64 = 0.15;
+const APART: f64 = 0.25;
 
 /// How far beyond its cell an edge may lie, in voxels: the tip of a wedge holds no voxel.
-const BEYOND: f64 = 0.5;
+const BEYOND: f64 = 1.0;
 
-/// cos 40°.
-const LEAST_TURN: f64 = 0.766;
+/// cos 30°.
+const LEAST_TURN: f64 = 0.866;
 
 /// Weight of the middle of the crossings against the planes, which settles what these leave open.
 const PULL: f64 = 0.01;
@@ -38,11 +42,17 @@ const CORNER: f64 = 0.2;
 /// Whether a sharp edge may pass a cell with these values at its corners, in voxels.
 #[inline(always)]
 pub(super) fn may_be_sharp(values: &[f32; 8]) -> bool {
-    [4, 2, 1].into_iter().any(|step| {
-        let along = (0..8).filter(|c| c & step == 0).map(|c| values[c | step] - values[c]);
-        let (lo, hi) = along.fold((f32::INFINITY, f32::NEG_INFINITY), |(lo, hi), d| (lo.min(d), hi.max(d)));
-        hi - lo > BENT
-    })
+    let (mut bent, mut squared) = (false, 0.0);
+    for step in [4, 2, 1] {
+        let (mut lo, mut hi, mut sum) = (f32::INFINITY, f32::NEG_INFINITY, 0.0);
+        for c in (0..8).filter(|c| c & step == 0) {
+            let along = values[c | step] - values[c];
+            (lo, hi, sum) = (lo.min(along), hi.max(along), sum + along);
+        }
+        bent |= hi - lo > BENT;
+        squared += (sum / 4.0) * (sum / 4.0);
+    }
+    bent || squared < SHORT
 }
 
 /// The ends of the sharp convex edge of the solid `side`·(φ − iso) < 0 in the cell with first corner `cell`, relative to that; twice

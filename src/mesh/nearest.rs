@@ -18,7 +18,7 @@ use rustc_hash::FxHashMap;
 
 use super::cluster::{Candidates, Clusters, Nearby, Query, SLACK};
 use crate::error::Result;
-use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues};
+use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset};
 use crate::levelset::BYTES_A_LEAF;
 use crate::levelset::isosurface::{IsoSurface, SHARP_TRIANGLES};
 use crate::run::RunOptions;
@@ -43,6 +43,8 @@ pub(super) struct Band {
     pub background: f32,
     /// Whether the surface at an offset is that of the field's sharp edges, not of the polygons that cut them off.
     pub sharp: bool,
+    /// Whether voxels of cubes of [`BLOCK`]³ that are not wanted stay as they are in the field, within leaves that are. Without an offset only.
+    pub keeps: bool,
 }
 
 impl Band {
@@ -180,7 +182,9 @@ fn gap_squared(a: (IVec3, IVec3), b: (IVec3, IVec3)) -> i32 {
 struct Scratch {
     /// Places of leaves of the surface, with the squares of their distances from the tile.
     near: Vec<(usize, i32)>,
-    /// Square of the distance up to which triangles can be nearest to a voxel of the tile.
+    /// The part of the tile that is wanted, by its first and last voxel.
+    bounds: (IVec3, IVec3),
+    /// Square of the distance up to which triangles can be nearest to a voxel of it.
     farthest: i32,
     clusters: Clusters,
     /// The candidates of the current block at each level below the tile.
@@ -199,10 +203,11 @@ struct Search<'a> {
 impl Search<'_> {
     /// Finds the leaves of the surface near a tile, none if no voxel of it can be in the band; returns the number of their triangles.
     fn collect(&self, tile: IVec3, scratch: &mut Scratch) -> u64 {
-        let Scratch { near, farthest, .. } = scratch;
-        let bounds = tile_bounds(tile);
+        scratch.bounds = self.wanted_part(tile);
+        let Scratch { near, bounds, farthest, .. } = scratch;
+        let bounds = *bounds;
         let reach = self.band.reach();
-        // No voxel of the tile is farther from the surface than from the farthest point of any leaf with some of it.
+        // No voxel of it is farther from the surface than from the farthest point of any leaf with some of it.
         *farthest = (reach * reach).ceil() as i32;
         let mut nearest = i32::MAX;
         near.clear();
@@ -229,33 +234,47 @@ impl Search<'_> {
         if self.band.sharp { polygons * (1 + SHARP_TRIANGLES) } else { polygons }
     }
 
+    /// The box of the leaves of a tile that are wanted. At an offset the tile itself: blocks that reach beyond the box are then judged by the sign of a voxel
+    /// whose triangles were not collected; without, both sides of the band are alike.
+    fn wanted_part(&self, tile: IVec3) -> (IVec3, IVec3) {
+        let whole = tile_bounds(tile);
+        if self.band.offset != 0.0 {
+            return whole;
+        }
+        let along = || (0..TILE / LEAF_DIM).map(|k| k * LEAF_DIM);
+        let leaves = along().flat_map(|x| along().flat_map(move |y| along().map(move |z| IVec3::new(x, y, z))));
+        let leaves = leaves.map(|leaf| (whole.0 + leaf, whole.0 + leaf + (LEAF_DIM - 1)));
+        let wanted = leaves.filter(|&(first, last)| (self.wanted)(first, last));
+        wanted.reduce(|(lo, hi), (first, last)| (lo.min(first), hi.max(last))).unwrap_or(whole)
+    }
+
     /// Adds the leaves of a tile that have voxels in the band, from the triangles of what was collected.
     fn tile(&self, tile: IVec3, scratch: &mut Scratch, leaves: &mut Vec<Leaf>) {
-        let Scratch { near, farthest, clusters, lists } = scratch;
+        let Scratch { near, bounds, farthest, clusters, lists } = scratch;
         if near.is_empty() {
             return;
         }
-        let bounds = tile_bounds(tile);
+        let first = tile_bounds(tile).0;
         clusters.clear();
         for &(place, _) in near.iter() {
             let leaf = &self.surface.leaves()[place];
             let from = self.field.origin(leaf.id);
-            let wanted = |cell: IVec3| gap_squared(bounds, (from + cell, from + cell + 1)) <= *farthest;
+            let wanted = |cell: IVec3| gap_squared(*bounds, (from + cell, from + cell + 1)) <= *farthest;
             self.surface.for_each_triangle(leaf, wanted, |cell, corners| {
-                clusters.push((from + cell - bounds.0).as_vec3(), corners);
+                clusters.push((from + cell - first).as_vec3(), corners);
             });
             if self.band.sharp {
                 // Outwards the edges of the inside count, inwards those of the outside.
                 let side = if self.band.offset >= 0.0 { 1.0 } else { -1.0 };
                 let of = (side, self.band.voxel_size.recip() as f32);
                 self.surface.for_each_sharp_triangle(leaf, of, wanted, |cell, corners| {
-                    clusters.push((from + cell - bounds.0).as_vec3(), corners);
+                    clusters.push((from + cell - first).as_vec3(), corners);
                 });
             }
         }
         clusters.finish();
         let block = Block { origin: IVec3::ZERO, edge: TILE, nearest: 0 };
-        self.halves(bounds.0, block, clusters, &clusters.boxes, lists, leaves);
+        self.halves(first, block, clusters, &clusters.boxes, lists, leaves);
     }
 
     /// Goes down into the eight halves of a block, whose candidates are `from`.
@@ -350,10 +369,19 @@ impl Search<'_> {
         let Band { offset, voxel_size, background, .. } = self.band;
         let reach = self.band.reach();
         let origin = tile + block.origin;
-        let field = &self.field.values(self.field.find(origin)).0;
+        let id = self.field.find(origin);
+        let (field, was) = (&self.field.values(id).0, self.field.mask(id));
         for half in block.halves() {
             let first = tile + half.origin;
-            if half.edge >= LEAF_DIM && !(self.wanted)(first, first + (half.edge - 1)) {
+            if self.band.keeps && !(self.wanted)(first, first + (half.edge - 1)) {
+                let first = half.origin - block.origin;
+                for (x, y) in (0..BLOCK).flat_map(|x| (0..BLOCK).map(move |y| (x, y))) {
+                    let start = leaf_offset(first + IVec3::new(x, y, 0));
+                    for at in start..start + BLOCK as usize {
+                        values.0[at] = field[at];
+                        active.set(at, was.get(at));
+                    }
+                }
                 continue;
             }
             let (side, mut nearest) = self.enter(tile, half, clusters, from, list);

@@ -77,7 +77,7 @@ pub fn rebuild(level_set: &LevelSet, what: &Rebuild, run: &RunOptions) -> Result
     }
     let background = background(half_width, &transform);
     let sharp = sharp && offset != 0.0;
-    let band = Band { offset, half_width: f64::from(half_width), voxel_size, background, sharp };
+    let band = Band { offset, half_width: f64::from(half_width), voxel_size, background, sharp, keeps: false };
     let leaves = leaves_of_band(OPERATION, &surface, level_set.grid(), iso, band, |_, _| true, run)?;
     Ok(LevelSet::new(grid_of_parts(background, &leaves), transform))
 }
@@ -117,22 +117,23 @@ pub fn widened(
     Ok(LevelSet::new(grid_of_parts(background, &parts), transform))
 }
 
-/// The same surface with exact distances in the leaves for whose first and last voxel `wanted` holds, as it must for every box around one; all else
-/// stays as it is, in the pages that it shares.
+/// The same surface with exact distances in the cubes of 4³ voxels for whose first and last voxel `wanted` holds, as it must for every box around one; all
+/// else stays as it is, in the pages that it shares.
 pub fn rebuild_where(
     level_set: &LevelSet,
     wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
     run: &RunOptions,
 ) -> Result<LevelSet> {
     let (mut grid, background) = (level_set.grid().clone(), level_set.background());
-    let rebuilt = rebuilt_leaves(level_set, level_set.half_width(), &wanted, run)?;
+    let rebuilt = band_of(level_set, level_set.half_width(), true, &wanted, run)?;
     let mut missing: Vec<IVec3> =
         rebuilt.iter().flatten().map(|leaf| leaf.0).filter(|&o| grid.find(o).is_sentinel()).collect();
     missing.sort_unstable_by_key(|o| (o.x, o.y, o.z));
     grid.add_leaves(&missing);
     let new: FxHashMap<LeafId, &Leaf> = rebuilt.iter().flatten().map(|leaf| (grid.find(leaf.0), leaf)).collect();
     let is_wanted = |id: &LeafId| wanted(grid.origin(*id), grid.origin(*id) + (LEAF_DIM - 1));
-    let leaves: LeafSet = grid.leaves().iter().copied().filter(is_wanted).collect();
+    let leaves: Vec<LeafId> = grid.leaves().par_iter().copied().filter(is_wanted).collect();
+    let leaves: LeafSet = leaves.into_iter().collect();
     grid.update(&leaves, |id, values, mask| match new.get(&id) {
         Some((_, there, active)) => {
             values.clone_from(there);
@@ -156,11 +157,22 @@ pub(crate) fn rebuilt_leaves(
     wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
     run: &RunOptions,
 ) -> Result<Vec<Vec<Leaf>>> {
+    band_of(level_set, half_width, false, wanted, run)
+}
+
+/// The same; voxels that are not wanted stay as they are if it `keeps` them.
+fn band_of(
+    level_set: &LevelSet,
+    half_width: f32,
+    keeps: bool,
+    wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
+    run: &RunOptions,
+) -> Result<Vec<Vec<Leaf>>> {
     let transform = level_set.transform();
     let background = background(half_width, transform);
     let surface = surface_of(level_set, 0.0, OPERATION, run)?;
     let (half, voxel_size) = (f64::from(half_width), transform.voxel_size());
-    let band = Band { offset: 0.0, half_width: half, voxel_size, background, sharp: false };
+    let band = Band { offset: 0.0, half_width: half, voxel_size, background, sharp: false, keeps };
     leaves_of_band(OPERATION, &surface, level_set.grid(), 0.0, band, wanted, run)
 }
 
@@ -282,6 +294,38 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn where_it_is_wanted_distances_are_those_of_all_and_elsewhere_nothing_changes() {
+        let mut distorted = parts();
+        let all: LeafSet = distorted.grid().leaves().iter().copied().collect();
+        distorted.grid_mut().update(&all, |_, values, mask| {
+            mask.iter().for_each(|at| values.0[at] *= 0.75);
+        });
+        let centre = DVec3::new(9.0, 3.0, 5.0);
+        let near = |first: IVec3, last: IVec3| {
+            let nearest = centre.clamp(first.as_dvec3(), last.as_dvec3());
+            nearest.distance(centre) < 9.0
+        };
+        let run = RunOptions::default();
+        let (part, whole) =
+            (rebuild_where(&distorted, near, &run).unwrap(), rebuild(&distorted, &Rebuild::band(3.0), &run).unwrap());
+        let mut changed = 0;
+        for n in 0..64i32.pow(3) {
+            let ijk = IVec3::new(n / 4096, n / 64 % 64, n % 64) - 32;
+            let cube = ijk.div_euclid(IVec3::splat(4)) * 4;
+            let [(value, active), (before, was_active)] = [&part, &distorted].map(|l| l.grid().voxel(ijk));
+            if near(cube, cube + 3) {
+                // The nearest of two triangles that share a vertex may be the other one: the last bit differs.
+                let (expected, expected_active) = whole.grid().voxel(ijk);
+                assert!((value - expected).abs() <= 3.0 * f32::EPSILON && active == expected_active, "{ijk}");
+            } else {
+                assert_eq!((value.to_bits(), active), (before.to_bits(), was_active), "{ijk}");
+            }
+            changed += i32::from(value != before);
+        }
+        assert!(changed > 500, "{changed}");
     }
 
     fn moved(half_width: f32, offset: f64) -> Rebuild {

@@ -177,19 +177,64 @@ pub(super) fn held(
     let report = flow(level_set)?;
     let nothing = LevelSet::empty(*original.transform(), original.half_width());
     let moved = std::mem::replace(level_set, nothing);
-    *level_set = if report.steps == 0 { moved } else { kept(&original, restored(&moved, region, run)?, region) };
+    *level_set = if report.steps == 0 { moved } else { kept(&original, restored(&original, &moved, run)?, region) };
     Ok(report)
 }
 
-/// Exact distances where a region acts, and as far from there as they can have changed.
-fn restored(level_set: &LevelSet, region: &dyn Region, run: &RunOptions) -> Result<LevelSet> {
-    let (transform, margin) = (level_set.transform(), f64::from(level_set.half_width()) + 1.0);
-    let touched = |first: IVec3, last: IVec3| {
-        let (centre, radius) = ((first + last).as_dvec3() / 2.0, (last - first).as_dvec3().length() / 2.0);
-        let radius = (radius + margin) * transform.voxel_size();
-        region.weights_within(transform.index_to_world(centre), radius)[1] > 0.0
-    };
-    rebuild_where(level_set, touched, run)
+/// Exact distances where a flow has changed the field, and as far from there as distances can have changed.
+fn restored(original: &LevelSet, moved: &LevelSet, run: &RunOptions) -> Result<LevelSet> {
+    let changed = Changed::between(original.grid(), moved.grid(), moved.half_width() + 1.0);
+    rebuild_where(moved, |first, last| changed.touches(first, last), run)
+}
+
+/// The cubes of 4³ voxels in which two grids differ, and those around.
+struct Changed {
+    /// Places of the cubes and of the boxes of 8, 16 and 32 voxels that hold them, in units of their edges.
+    boxes: [FxHashSet<IVec3>; 4],
+}
+
+impl Changed {
+    const CUBE: i32 = 4;
+
+    /// What of `new` is no more than `margin` voxels from a voxel that is not as in `old`.
+    fn between(old: &Grid, new: &Grid, margin: f32) -> Self {
+        let cubes_of = |&id: &LeafId| {
+            let from = old.find(new.origin(id));
+            if from == id && new.shares_storage(old, id) {
+                return Vec::new();
+            }
+            let other = old.mask(from).zip(new.mask(id), |a, b| a ^ b);
+            let (before, after) = (&old.values(from).0, &new.values(id).0);
+            let mut differs = [false; 8];
+            for at in 0..LEAF_VOXELS {
+                // The upper bits of x, y and z.
+                let cube = at >> 6 & 4 | at >> 4 & 2 | at >> 2 & 1;
+                differs[cube] |= before[at].to_bits() != after[at].to_bits() || other.get(at);
+            }
+            let first = new.origin(id) / Self::CUBE;
+            let cubes = (0..8).filter(|&cube| differs[cube]).map(|cube| cube as i32);
+            cubes.map(|cube| first + IVec3::new(cube >> 2, cube >> 1 & 1, cube & 1)).collect()
+        };
+        let cubes: Vec<Vec<IVec3>> = new.leaves().par_iter().map(cubes_of).collect();
+        let reach = (margin / Self::CUBE as f32).ceil() as i32;
+        let along = || -reach..=reach;
+        let mut boxes: [FxHashSet<IVec3>; 4] = Default::default();
+        for cube in cubes.concat() {
+            let around = along().flat_map(|x| along().flat_map(move |y| along().map(move |z| IVec3::new(x, y, z))));
+            boxes[0].extend(around.map(|step| cube + step));
+        }
+        for level in 1..boxes.len() {
+            boxes[level] = boxes[level - 1].iter().map(|place| *place >> 1).collect();
+        }
+        Self { boxes }
+    }
+
+    /// Whether a box of 4, 8, 16 or 32 voxels holds any of it.
+    fn touches(&self, first: IVec3, last: IVec3) -> bool {
+        let edge = last.x - first.x + 1;
+        let level = (edge / Self::CUBE).ilog2() as usize;
+        self.boxes.get(level).is_none_or(|boxes| boxes.contains(&first.div_euclid(IVec3::splat(edge))))
+    }
 }
 
 /// φ ← (1 − α) φ + α φ_new where α > 0.
@@ -381,11 +426,21 @@ impl<'a> Merge<'a> {
                 return found;
             }
             cube.gather(grid.value_pages(), &grid.neighbours()[id.index()], kept);
-            for at in kept.iter() {
-                let (local, value) = (offset_to_local(at), grid.values(id).0[at]);
-                let value_at = |ijk: IVec3| cube.slab(ijk.x as usize)[(ijk.y * (LEAF_DIM + 2) + ijk.z) as usize];
-                if beside.iter().any(|(step, most)| side * (value_at(local + *step) - value) > *most) {
-                    found.push((origin + local, value));
+            for (x, word) in kept.0.into_iter().enumerate() {
+                for y in (0..8).filter(|y| word >> (8 * y) & 0xff != 0) {
+                    // A row at once: hardly any voxel is one.
+                    let row = |x: usize, y: usize, z: usize| &cube.slab(x)[y * (LEAF_DIM as usize + 2) + z..][..8];
+                    let here = row(x + 1, y + 1, 1);
+                    let mut steep = [false; 8];
+                    for (step, most) in &beside {
+                        let [sx, sy, sz] = step.to_array().map(|s| s as usize);
+                        for ((steep, there), here) in steep.iter_mut().zip(row(x + sx, y + sy, sz)).zip(here) {
+                            *steep |= side * (there - here) > *most;
+                        }
+                    }
+                    for z in (0..8).filter(|&z| steep[z] && word >> (8 * y + z) & 1 == 1) {
+                        found.push((origin + IVec3::new(x as i32, y as i32, z as i32), here[z]));
+                    }
                 }
             }
             found

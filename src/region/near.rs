@@ -89,6 +89,10 @@ impl Region for Near {
     }
 
     fn weights_within(&self, centre: DVec3, radius: f64) -> [f32; 2] {
+        let (lo, hi) = self.bounds;
+        if (centre + radius).cmplt(lo).any() || (centre - radius).cmpgt(hi).any() {
+            return [0.0; 2];
+        }
         let distance = self.closest(centre).0;
         [radius, -radius].map(|by| self.at(distance + by * (1.0 + SURELY)))
     }
