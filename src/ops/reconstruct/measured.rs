@@ -54,7 +54,7 @@ pub(super) struct Head {
     pub nearest: f32,
 }
 
-/// What a map says at two rows: a line of memory, since reading it is most of the work. D is exact to a 65,000th of the map's reach, some 5e-4 voxel.
+/// What a map says at two rows: a line of memory, since reading it is most of the work. D is exact to a 65,000th of the map's reach.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct RowPair {

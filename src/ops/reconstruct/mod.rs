@@ -13,7 +13,7 @@
 //! inside, but for what no map has in its picture; specks and bubbles are dropped. It then follows the flow. The window must be narrower than a third of the object, or maps of its far side interfere.
 //!
 //! What the maps say of a voxel is looked up once, for the first surface and for the flow; normals, and with them V, φ and ρ, are those of each step. It is kept in
-//! 64 bytes for sixteen voxels and a map, D to 5e-4 voxel.
+//! 64 bytes for sixteen voxels and a map, D to a 65,000th of the farthest that matters: 3e-4 voxel for the narrowest window.
 //!
 //! Measured (tests): a torus of 9.4 voxels from six parallel maps with noise of a fifth of that radius is met within 0.13 voxel RMS and its volume within 1.8 %;
 //! without noise and prior within 0.08 voxel. From six maps of cameras at five radii the volume is within 1 % with β = 1 and 3 % too small with β = 2:
