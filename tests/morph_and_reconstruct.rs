@@ -180,6 +180,68 @@ fn what_cannot_become_what() {
     assert!(!folder.join("o.vdb").exists());
 }
 
+/// A greyscale picture of 16 bits, or one of colours.
+fn picture(path: &Path, side: u32, depth: png::BitDepth, kind: png::ColorType, bytes: &[u8]) {
+    let mut encoder = png::Encoder::new(std::fs::File::create(path).unwrap(), side, side);
+    encoder.set_color(kind);
+    encoder.set_depth(depth);
+    encoder.write_header().unwrap().write_image_data(bytes).unwrap();
+}
+
+/// Depth maps with pictures of what they show: a ball whose eighths have colours of their own, in the vertices of a mesh and in a grid of vectors.
+#[test]
+fn range_maps_with_colours() {
+    const SIDE: u32 = 120;
+    let desk = tempfile::tempdir().unwrap();
+    let folder = desk.path();
+    let of_eighth = |p: DVec3| p.to_array().map(|x| if x > 0.0 { 1.0f32 } else { 0.0 });
+    let (pitch, first) = (2.4 / f64::from(SIDE - 1), -1.2);
+    let mut description = format!(
+        "version = 1\nscale = 0.0001\nbackground = \"empty\"\northographic = {{ pitch = [{pitch}, {pitch}], first = [{first}, {first}] }}\n"
+    );
+    for (n, view) in [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z].into_iter().enumerate() {
+        let side = if view.z == 0.0 { DVec3::Z.cross(view) } else { DVec3::X };
+        let up = view.cross(side);
+        let (mut depths, mut colors) = (Vec::new(), Vec::new());
+        for at in 0..SIDE * SIDE {
+            let (x, y) = (first + pitch * f64::from(at % SIDE), first + pitch * f64::from(at / SIDE));
+            let height = (1.0 - x * x - y * y).sqrt();
+            // Nothing was measured where the count is 0.
+            let count = if height.is_nan() { 0 } else { ((3.0 - height) * 1e4).round() as u16 };
+            depths.extend(count.to_be_bytes());
+            colors.extend(of_eighth(side * x + up * y + view * height).map(|c| (255.0 * c) as u8));
+        }
+        picture(&folder.join(format!("{n}.png")), SIDE, png::BitDepth::Sixteen, png::ColorType::Grayscale, &depths);
+        picture(&folder.join(format!("c{n}.png")), SIDE, png::BitDepth::Eight, png::ColorType::Rgb, &colors);
+        let row = |k: usize| [side[k], up[k], view[k], 3.0 * view[k]];
+        let pose = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
+        description += &format!("[[map]]\nfile = \"{n}.png\"\ncolor = \"c{n}.png\"\npose = {pose:?}\n");
+    }
+    std::fs::write(folder.join("set.toml"), description).unwrap();
+    for output in ["ball.ply", "ball.vdb"] {
+        let words =
+            ["reconstruct", "set.toml", "-o", output, "--voxel-size", "0.05", "--beta", "0", "--check", "--json"];
+        assert_eq!(done(&words, folder)["components_after"], 1);
+    }
+    let ball = mesh::read(&folder.join("ball.ply")).unwrap().mesh;
+    let run = vdb_edit::run::RunOptions::default();
+    let file = vdb_edit::vdb::open(folder.join("ball.vdb"), &run).unwrap();
+    let volumes = file.read_vectors(file.select_vector(Some("Cd")).unwrap(), &run).unwrap();
+    let mut eighths = std::collections::BTreeMap::new();
+    for (p, color) in ball.positions.iter().zip(ball.colors.as_ref().unwrap()) {
+        assert!((p.length() - 1.0).abs() < 0.02, "{p}");
+        // Two voxels from where colours meet.
+        if p.abs().min_element() > 0.1 {
+            let expected = of_eighth(*p);
+            let voxel = [0, 1, 2].map(|k| volumes.components[k].trilinear(*p) as f32);
+            assert!((0..3).all(|k| (color[k] - expected[k]).abs() < 0.01), "{p} {color:?}");
+            assert!((0..3).all(|k| (voxel[k] - expected[k]).abs() < 0.02), "{p} {voxel:?}");
+            *eighths.entry(expected.map(|c| c as u8)).or_insert(0) += 1;
+        }
+    }
+    assert!(eighths.len() == 8 && eighths.values().all(|count| *count > 100), "{eighths:?}");
+}
+
 /// Mean and 95th percentile of the distance of the vertices of one mesh from another.
 fn distances(from: &TriangleMesh, to: &TriangleMesh) -> (f64, f64) {
     let tree = Bvh::new((0..to.triangles.len()).map(|t| to.corners(t)).collect());

@@ -197,9 +197,9 @@ pub(super) fn bytes_needed(grid: &Grid) -> u64 {
 }
 
 /// The connected parts of one leaf's inside: rarely more than one.
-type Parts = SmallVec<[LeafMask; 1]>;
+pub(super) type Parts = SmallVec<[LeafMask; 1]>;
 
-fn split(inside: LeafMask) -> Parts {
+pub(super) fn split(inside: LeafMask) -> Parts {
     let mut rest = inside;
     let mut parts = Parts::new();
     while let Some(seed) = rest.iter().next() {

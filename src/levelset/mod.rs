@@ -20,6 +20,7 @@ pub(crate) mod sample;
 pub mod shapes;
 mod sharp;
 pub mod smooth_csg;
+mod specks;
 mod sweep;
 #[cfg(test)]
 pub(crate) mod testing;

@@ -12,7 +12,7 @@
 //! Most of a surface arrives long before its last part. So every few steps the leaves whose surface has not moved since the last look are left out until a
 //! leaf beside them moves.
 
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, mask32x16};
 use glam::{DVec3, IVec3};
 
 use super::evolve::{Motion, Report, Until, drive};
@@ -49,11 +49,6 @@ const WORTH_A_PART: f64 = 0.8;
 pub trait SurfaceSpeed: Sync {
     /// Writes F (world units a unit of time, positive outwards) of the voxels of a leaf, and sums up what is wanted of the surface there.
     fn of_leaf(&self, leaf: &LeafSurface<'_>, speed: &mut LeafValues) -> Tally;
-
-    /// Whether F may be other than 0 in the leaf whose first voxel is `origin`; where not, the surface is not looked for.
-    fn acts_on(&self, _origin: IVec3, _background: f32) -> bool {
-        true
-    }
 }
 
 /// Sums over the surface, of what a speed measures there.
@@ -119,8 +114,8 @@ impl LeafSurface<'_> {
     /// Of these, the ones less than half a voxel from the surface: they stand for it.
     pub fn beside(&self) -> LeafMask {
         let mut beside = LeafMask::EMPTY;
-        self.moving.iter().filter(|&at| self.depth.0[at].abs() < 0.5).for_each(|at| beside.set(at, true));
-        beside
+        dispatch(Beside { depth: self.depth, beside: &mut beside });
+        beside.zip(self.moving, |beside, moving| beside & moving)
     }
 
     /// Unit normals in index axes, an axis each; 0 where the field is flat. Of the rows that have a moving voxel.
@@ -287,15 +282,11 @@ impl Motion for Moving<'_> {
                     let (origin, background) = (grid.origin(id), grid.background());
                     let speed = &mut speed[PageLeaves::slot(id)];
                     let moved = if limit.is_some() { rest.moved(grid, id) } else { 0.0 };
-                    if !source.acts_on(origin, background) {
-                        speed.0.fill(0.0);
-                        found.push(OfLeaf { id, origin, tally: Tally::default(), fastest: 0.0, moved });
-                        return;
-                    }
                     dispatch(Feet { tracker, id, moving, halo: &mut halo, normal: &mut normal, depth: &mut depth });
                     let leaf = LeafSurface { origin, background, moving, normal: &normal, depth: &depth };
                     let tally = source.of_leaf(&leaf, speed);
-                    let fastest = moving.iter().map(|at| speed.0[at].abs()).fold(0.0, f32::max);
+                    let mut fastest = 0.0;
+                    dispatch(Fastest { moving, speed, fastest: &mut fastest });
                     found.push(OfLeaf { id, origin, tally, fastest, moved });
                 });
             }
@@ -402,6 +393,49 @@ impl Work for Feet<'_> {
                 (halo.centre(simd, x, y) * per_voxel / steep).store_slice(&mut depth.0[at..at + 16]);
             },
         );
+    }
+}
+
+/// The voxels less than half a voxel from the surface.
+struct Beside<'a> {
+    depth: &'a LeafValues,
+    beside: &'a mut LeafMask,
+}
+
+impl Work for Beside<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        for (x, word) in self.beside.0.iter_mut().enumerate() {
+            for pair in 0..4 {
+                let at = x * 64 + pair * 16;
+                let depth = Lanes::from_slice(simd, &self.depth.0[at..at + 16]);
+                *word |= depth.abs().simd_lt(0.5).to_bitmask() << (16 * pair);
+            }
+        }
+    }
+}
+
+/// The largest |F| of voxels that move.
+struct Fastest<'a> {
+    moving: LeafMask,
+    speed: &'a LeafValues,
+    fastest: &'a mut f32,
+}
+
+impl Work for Fastest<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let zero = Lanes::splat(simd, 0.0);
+        let mut most = zero;
+        self.moving.for_each_pair(
+            #[inline(always)]
+            |x, y, bits| {
+                let at = x * 64 + y * 8;
+                let speed = Lanes::from_slice(simd, &self.speed.0[at..at + 16]).abs();
+                most = most.max(mask32x16::from_bitmask(simd, u64::from(bits)).select(speed, zero));
+            },
+        );
+        *self.fastest = (0..16).map(|k| most[k]).fold(0.0, f32::max);
     }
 }
 

@@ -125,17 +125,15 @@ pub struct RangeMap {
 }
 
 /// What a map says of all points of a ball.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Around {
     /// The ball is outside of its picture.
     Outside,
     /// No ray through it has a measurement.
     Invalid,
-    /// All of it is in front of what was measured.
-    InFront,
-    /// All of it is behind.
-    Behind,
-    /// One thing here, another there.
+    /// All rays through it have one: the least and the largest signed distance along them, positive in front of what was measured.
+    Measured(f64, f64),
+    /// One thing here, another there, or as near to what was measured as not to matter, or too near to the scanner to be told.
     Mixed,
 }
 
@@ -164,8 +162,8 @@ impl RangeMap {
         self.colors.get(v * self.width + u).copied().filter(|_| within)
     }
 
-    /// What it says of the points up to `radius` from a point of the world, `clear` being how far from what was measured they have to be.
-    pub fn look_around(&self, to_scanner: &DAffine3, xyz: DVec3, radius: f64, clear: f64) -> Around {
+    /// What it says of the points up to `radius` from a point of the world. Where some may be less than `near` from what was measured, that is not looked into.
+    pub fn look_around(&self, to_scanner: &DAffine3, xyz: DVec3, radius: f64, near: f64) -> Around {
         let p = to_scanner.transform_point3(xyz);
         let Some((_, range)) = self.projection.project(p) else { return Around::Mixed };
         let (mut lo, mut hi) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
@@ -190,25 +188,22 @@ impl RangeMap {
         if !(lo.cmpge(DVec2::ZERO).all() && hi.cmplt(size).all()) || (hi - lo).element_product() > 4096.0 {
             return Around::Mixed;
         }
-        let (mut least, mut most, mut valid, mut all) = (f32::INFINITY, f32::NEG_INFINITY, 0, 0);
+        let (mut least, mut most, mut gaps) = (f32::INFINITY, f32::NEG_INFINITY, 0);
         for v in lo.y as usize..=hi.y as usize {
-            for range in &self.ranges[v * self.width + lo.x as usize..=v * self.width + hi.x as usize] {
-                all += 1;
-                if !range.is_nan() {
-                    (least, most, valid) = (least.min(*range), most.max(*range), valid + 1);
-                }
+            for &range in &self.ranges[v * self.width + lo.x as usize..=v * self.width + hi.x as usize] {
+                // Neither holds of what is no number.
+                least = if range < least { range } else { least };
+                most = if range > most { range } else { most };
+                gaps += usize::from(range.is_nan());
+            }
+            let is_near = f64::from(least) - range - radius <= near && f64::from(most) - range + radius >= -near;
+            if is_near || gaps > 0 && least <= most {
+                return Around::Mixed;
             }
         }
-        if valid == 0 {
-            Around::Invalid
-        } else if valid < all {
-            Around::Mixed
-        } else if f64::from(least) - range - radius > clear {
-            Around::InFront
-        } else if range - radius - f64::from(most) > clear {
-            Around::Behind
-        } else {
-            Around::Mixed
+        match gaps {
+            0 => Around::Measured(f64::from(least) - range - radius, f64::from(most) - range + radius),
+            _ => Around::Invalid,
         }
     }
 

@@ -25,4 +25,4 @@ mod turning;
 pub use files::RangeSet;
 pub use map::{Around, Background, MOST_PIXELS, Projection, RangeMap, draw_parallel};
 use map::{check_rigid, rigid};
-pub use sight::Sight;
+pub use sight::{Picture, Sight};

@@ -3,7 +3,7 @@
 //! In single precision: ranges err by a part in ten million, angles by as much of a turn. Points are given in the scanner's frame, so that where that lies in
 //! the world costs no digits.
 
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
 
 use super::{Projection, RangeMap};
 use crate::stencil::simd::{Lanes, splat};
@@ -26,59 +26,92 @@ struct Pixels<S: Simd> {
     density: Lanes<S>,
 }
 
-impl RangeMap {
+/// A map as it is looked at: range and confidence of a pixel lie side by side.
+pub struct Picture<'a> {
+    map: &'a RangeMap,
+    /// Row by row.
+    pixels: Vec<[f32; 2]>,
+}
+
+impl<'a> Picture<'a> {
+    /// Of a map as it is now.
+    pub fn new(map: &'a RangeMap) -> Self {
+        let pixels = map.ranges.iter().zip(&map.weights).map(|(range, weight)| [*range, *weight]).collect();
+        Self { map, pixels }
+    }
+
     /// What it says of points in the scanner's frame.
     #[inline(always)]
     pub fn look<S: Simd>(&self, simd: S, points: [Lanes<S>; 3]) -> Sight<S> {
-        let Pixels { u, v, range, density } = self.projection.pixels(simd, points);
-        let (mut us, mut vs) = ([0.0; 16], [0.0; 16]);
-        u.store_slice(&mut us);
-        v.store_slice(&mut vs);
-        let (mut measured, mut weights) = ([f32::NAN; 16], [0.0; 16]);
-        for k in 0..16 {
-            (measured[k], weights[k]) = self.between_pixels(us[k], vs[k]);
-        }
-        Sight {
-            distance: Lanes::from_slice(simd, &measured) - range,
-            weight: Lanes::from_slice(simd, &weights),
-            density,
-        }
+        let Pixels { u, v, range, density } = self.map.projection.pixels(simd, points);
+        let [measured, weight] = self.between_pixels(simd, u, v);
+        Sight { distance: measured - range, weight, density }
     }
 
     /// Range and confidence between pixels: bilinear where all four pixels around are valid, else those of the nearest one. The range is ∞ where that has none,
     /// NaN outside of the picture.
     #[inline(always)]
-    fn between_pixels(&self, u: f32, v: f32) -> (f32, f32) {
-        let (last_u, last_v) = (self.width as f32 - 1.0, self.height as f32 - 1.0);
-        if !(u > -0.5 && v > -0.5 && u < last_u + 0.5 && v < last_v + 0.5) {
-            return (f32::NAN, 0.0);
+    fn between_pixels<S: Simd>(&self, simd: S, u: Lanes<S>, v: Lanes<S>) -> [Lanes<S>; 2] {
+        let zero = Lanes::splat(simd, 0.0);
+        let (last_u, last_v) = (self.map.width as f32 - 1.0, self.map.height as f32 - 1.0);
+        let (least, half) = (Lanes::splat(simd, -0.5), 0.5);
+        // Neither holds of what is no number.
+        let within = u.simd_gt(least) & u.simd_lt(last_u + half) & v.simd_gt(least) & v.simd_lt(last_v + half);
+        let bits = within.to_bitmask();
+        let nowhere = Lanes::splat(simd, f32::NAN);
+        if bits == 0 {
+            return [nowhere, zero];
         }
-        let (u, v) = (u.clamp(0.0, last_u), v.clamp(0.0, last_v));
-        let (column, row) = (u as usize, v as usize);
-        let at = row * self.width + column;
-        if column + 1 < self.width
-            && let (Some(&[r00, r01]), Some(&[r10, r11])) =
-                (pair(&self.ranges, at), pair(&self.ranges, at + self.width))
-            && let (Some(&[w00, w01]), Some(&[w10, w11])) =
-                (pair(&self.weights, at), pair(&self.weights, at + self.width))
-            && !(r00 + r01 + r10 + r11).is_nan()
-        {
-            let (s, t) = (u - column as f32, v - row as f32);
-            let mix = |a: f32, b: f32, part: f32| a + (b - a) * part;
-            return (mix(mix(r00, r01, s), mix(r10, r11, s), t), mix(mix(w00, w01, s), mix(w10, w11, s), t));
+        let place = |at: Lanes<S>, last: f32| within.select(at.max(zero).min(Lanes::splat(simd, last)), zero);
+        let (u, v) = (place(u, last_u), place(v, last_v));
+        let (left, top) = (u.floor(), v.floor());
+        let (mut columns, mut rows) = ([0.0; 16], [0.0; 16]);
+        left.store_slice(&mut columns);
+        top.store_slice(&mut rows);
+        // Range and confidence of the four pixels around each point.
+        let mut around = [[[0.0; 16]; 2]; 4];
+        for k in 0..16 {
+            let (column, row) = (columns[k] as usize, rows[k] as usize);
+            let at = row * self.map.width + column;
+            let two = |at: usize| self.pixels.get(at..at + 2).filter(|_| column + 1 < self.map.width);
+            let four = match (two(at), two(at + self.map.width)) {
+                (Some(&[a, b]), Some(&[c, d])) => [a, b, c, d],
+                _ => [[f32::NAN, 0.0]; 4],
+            };
+            for (lanes, [range, weight]) in around.iter_mut().zip(four) {
+                (lanes[0][k], lanes[1][k]) = (range, weight);
+            }
         }
-        let nearest = (v + 0.5) as usize * self.width + (u + 0.5) as usize;
-        match (self.ranges.get(nearest), self.weights.get(nearest)) {
-            (Some(range), Some(weight)) if !range.is_nan() => (*range, *weight),
-            _ => (f32::INFINITY, 0.0),
+        let (s, t) = (u - left, v - top);
+        macro_rules! mixed {
+            ($what:literal) => {{
+                let [a, b, c, d] = around.each_ref().map(
+                    #[inline(always)]
+                    |lanes| Lanes::from_slice(simd, &lanes[$what]),
+                );
+                let (above, below) = (a + (b - a) * s, c + (d - c) * s);
+                above + (below - above) * t
+            }};
         }
+        let (range, weight) = (mixed!(0), mixed!(1));
+        // A single pixel without a measurement makes no number of it.
+        let gaps = bits & !range.simd_eq(range).to_bitmask();
+        let (range, weight) = (within.select(range, nowhere), within.select(weight, zero));
+        if gaps == 0 {
+            return [range, weight];
+        }
+        let (mut ranges, mut weights) = ([0.0; 16], [0.0; 16]);
+        range.store_slice(&mut ranges);
+        weight.store_slice(&mut weights);
+        for k in (0..16).filter(|k| gaps >> k & 1 == 1) {
+            let nearest = (v[k] + 0.5) as usize * self.map.width + (u[k] + 0.5) as usize;
+            [ranges[k], weights[k]] = match self.pixels.get(nearest) {
+                Some(&[range, weight]) if !range.is_nan() => [range, weight],
+                _ => [f32::INFINITY, 0.0],
+            };
+        }
+        [Lanes::from_slice(simd, &ranges), Lanes::from_slice(simd, &weights)]
     }
-}
-
-/// Two neighbours in a list.
-#[inline(always)]
-fn pair(values: &[f32], at: usize) -> Option<&[f32; 2]> {
-    values.get(at..at + 2).and_then(|two| two.try_into().ok())
 }
 
 impl Projection {
@@ -160,7 +193,7 @@ pub(super) mod tests {
     }
 
     struct Look<'a> {
-        map: &'a RangeMap,
+        picture: Picture<'a>,
         points: &'a [DVec3],
         out: &'a mut Vec<[f32; 3]>,
     }
@@ -170,7 +203,7 @@ pub(super) mod tests {
         fn run<S: Simd>(self, simd: S) {
             for points in self.points.chunks(16) {
                 let axis = |axis: usize| Lanes::from_fn(simd, |k| points.get(k).map_or(0.0, |p| p[axis] as f32));
-                let sight = self.map.look(simd, [axis(0), axis(1), axis(2)]);
+                let sight = self.picture.look(simd, [axis(0), axis(1), axis(2)]);
                 let all = [sight.distance, sight.weight, sight.density];
                 self.out.extend((0..points.len()).map(|k| all.map(|values| values[k])));
             }
@@ -180,7 +213,7 @@ pub(super) mod tests {
     /// D, confidence and density at points of the scanner's frame.
     fn look(map: &RangeMap, points: &[DVec3]) -> Vec<[f32; 3]> {
         let mut out = Vec::new();
-        dispatch(Look { map, points, out: &mut out });
+        dispatch(Look { picture: Picture::new(map), points, out: &mut out });
         out
     }
 

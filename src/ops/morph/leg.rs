@@ -138,6 +138,8 @@ impl Leg<'_> {
         take: &mut Take,
         run: &RunOptions,
     ) -> Result<Arrival> {
+        // By time it flows twice, since the time of arrival is not known before. States kept on the way, for the frames to be chosen from at the end, would have to lie
+        // within a hundredth of the way between frames: a hundred states in memory or on disk for each frame.
         let end = match self.spacing {
             FrameSpacing::Time if !places.is_empty() => {
                 self.steps(start, &[], true, &mut |_, _, _| Ok(()), 0.0, run)?.state.time

@@ -7,7 +7,7 @@
 //! An optional curvature prior −2βH keeps it smooth on the way, and a little off the target.
 //!
 //! Frame 1 is the first shape and the last frame the last one, unchanged; of a chain, each shape in between is a frame as well. The frames
-//! between lie at equal steps of RMS distance, time or volume. The lattice is that of the first shape.
+//! between lie at equal steps of RMS distance, time (which takes the flow twice, once to learn when it arrives) or volume. The lattice is that of the first shape.
 //!
 //! What only one of two shapes has: `parts`. The coordinate transformation under the flow: `pose`.
 //!

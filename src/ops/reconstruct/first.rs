@@ -1,15 +1,15 @@
-//! The first surface: where the maps put it voxel by voxel, without its specks.
+//! The first surface: where the maps put it voxel by voxel.
 
 use fearless_simd::{Select, Simd, SimdBase};
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 
 use super::NAME;
-use super::forces::{CUT, Forces, Sampled, Term, window};
+use super::measured::Measurements;
+use super::term::{CUT, Sampled, Term, window};
 use crate::error::Result;
 use crate::grid::{LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, offset_to_local};
-use crate::levelset::{LevelSet, UnionFind, background, grid_of_parts};
-use crate::mesh::{TriangleMesh, level_set_to_mesh};
+use crate::levelset::{LevelSet, background, grid_of_parts};
 use crate::range::Around;
 use crate::run::RunOptions;
 use crate::stencil::simd::{Lanes, Work, dispatch, splat};
@@ -29,19 +29,37 @@ struct Votes {
 }
 
 impl Votes {
-    /// Of the voxels around a point, up to `radius` away.
-    fn new(terms: &[Term], (centre, radius): (DVec3, f64)) -> Self {
+    /// Of the voxels around a point, up to `radius` away, in a band of some half width (world units).
+    fn new(terms: &[Term], (centre, radius): (DVec3, f64), half_width: f64) -> Self {
         let mut votes = Self::default();
+        // What the maps say in whose windows they are.
+        let (mut all_in_front, mut all_behind) = (true, true);
         for (number, term) in terms.iter().enumerate() {
-            match term.map.look_around(&term.to_scanner, centre, radius, CUT * term.width) {
+            let (cut, is_solid) = (CUT * term.width, term.thickness.is_infinite());
+            match term.look_around(centre, radius, half_width) {
                 Around::Outside => {}
                 Around::Invalid if term.sees_through() => votes.surely_empty = true,
                 Around::Invalid => votes.empty += 1,
-                Around::InFront => votes.in_front = true,
-                Around::Behind if term.thickness.is_finite() => votes.mixed.push(number),
-                Around::Behind => votes.behind += 1,
-                Around::Mixed => votes.mixed.push(number),
+                Around::Measured(least, _) if least > cut => votes.in_front = true,
+                Around::Measured(_, most) if most < -cut && is_solid => votes.behind += 1,
+                around => {
+                    let [least, most] = match around {
+                        Around::Measured(least, most) => [least, most],
+                        _ => [f64::NEG_INFINITY, f64::INFINITY],
+                    };
+                    all_in_front &= least > half_width;
+                    all_behind &= most < -half_width && is_solid;
+                    votes.mixed.push(number);
+                }
             }
+        }
+        // Where they agree, it does not matter how far the surface is.
+        if all_in_front && !votes.mixed.is_empty() {
+            votes.in_front = true;
+            votes.mixed.clear();
+        } else if all_behind && !votes.in_front && !votes.surely_empty {
+            votes.behind += votes.mixed.len() as u32;
+            votes.mixed.clear();
         }
         votes
     }
@@ -124,7 +142,7 @@ impl Found {
     }
 }
 
-impl Forces<'_> {
+impl Measurements<'_> {
     /// The zero set of the data term between two voxels, closed by the box. What maps say beside it is kept for the flow.
     pub fn first_surface(&self, half_width: f32, (lo, hi): (IVec3, IVec3), run: &RunOptions) -> Result<LevelSet> {
         let background = background(half_width, &self.transform);
@@ -147,7 +165,7 @@ impl Forces<'_> {
             .with_min_len(16)
             .map(|n| match run.is_cancelled() {
                 true => Votes::default(),
-                false => Votes::new(self.terms, self.ball(origin_of(n))),
+                false => Votes::new(self.terms, self.ball(origin_of(n)), background.into()),
             })
             .collect();
         run.check(NAME)?;
@@ -155,27 +173,30 @@ impl Forces<'_> {
         let split = |n: usize| !votes[n].mixed.is_empty() || votes[n].is_inside() && !is_whole(n);
         let leaves = (0..count).filter(|&n| split(n)).count() as u64;
         run.reserve(NAME, leaves.saturating_mul(5000), "take a larger voxel_size")?;
-        let of_leaf = |n: usize| {
+        let of_leaf = |sampled: &mut Vec<Sampled>, n: usize| {
             task.advance(1);
             if !split(n) || run.is_cancelled() || self.has_failed() {
                 return Found::Whole(votes[n].is_inside());
             }
             let origin = origin_of(n);
-            let mut sampled = Vec::with_capacity(votes[n].mixed.len());
+            sampled.clear();
             for &map in &votes[n].mixed {
-                sampled.extend(self.terms.get(map).map(|term| term.sample(map, origin, &self.transform)));
+                let Some(term) = self.terms.get(map) else { continue };
+                let mut more = Sampled::of(map);
+                term.sample(origin, &self.transform, &mut more);
+                sampled.push(more);
             }
-            let mut values = votes[n].values(self.terms, &sampled, background);
+            let mut values = votes[n].values(self.terms, sampled, background);
             if !is_whole(n) {
                 let outside = |at: &usize| !within(origin + offset_to_local(*at));
                 (0..LEAF_VOXELS).filter(outside).for_each(|at| values.0[at] = background);
             }
             if values.0.iter().any(|value| value.abs() < background) {
-                self.keep(origin, sampled);
+                self.complete(origin, sampled);
             }
             Found::Split(Box::new(values))
         };
-        let found: Vec<Found> = (0..count).into_par_iter().with_min_len(4).map(of_leaf).collect();
+        let found: Vec<Found> = (0..count).into_par_iter().with_min_len(4).map_init(Vec::new, of_leaf).collect();
         run.check(NAME)?;
         let signs: Vec<Option<bool>> = found.iter().map(Found::sign).collect();
         let sign = |place: IVec3| match place.cmpge(IVec3::ZERO).all() && place.cmplt(size).all() {
@@ -205,36 +226,4 @@ impl Forces<'_> {
         let grid = grid_of_parts(background, &parts);
         Ok(LevelSet::new(grid, self.transform))
     }
-}
-
-/// A surface as triangles, without its small pieces: those that enclose less than a part of what the largest does are specks or bubbles. Says how many went.
-pub(super) fn without_specks(level_set: &LevelSet, part: f64, run: &RunOptions) -> Result<(TriangleMesh, usize)> {
-    let mesh = level_set_to_mesh(level_set, 0.0, run)?;
-    let pieces = pieces(&mesh);
-    // Six times what a piece encloses, by its first vertex.
-    let mut volumes: Vec<Option<f64>> = vec![None; mesh.positions.len()];
-    for triangle in &mesh.triangles {
-        let piece = pieces[triangle[0] as usize] as usize;
-        let [a, b, c] = triangle.map(|v| mesh.positions[v as usize] - mesh.positions[piece]);
-        *volumes[piece].get_or_insert(0.0) += a.dot(b.cross(c));
-    }
-    let largest = volumes.iter().flatten().fold(0.0, |most: f64, volume| most.max(volume.abs()));
-    let is_speck = |volume: f64| volume.abs() < part * largest;
-    let gone = volumes.iter().flatten().filter(|volume| is_speck(**volume)).count();
-    if gone == 0 {
-        return Ok((mesh, 0));
-    }
-    let triangles =
-        mesh.triangles.into_iter().filter(|t| !volumes[pieces[t[0] as usize] as usize].is_some_and(is_speck)).collect();
-    Ok((TriangleMesh { triangles, ..mesh }, gone))
-}
-
-/// The first vertex of the connected piece to which each vertex belongs.
-fn pieces(mesh: &TriangleMesh) -> Vec<u32> {
-    let joined = UnionFind::new(mesh.positions.len());
-    mesh.triangles.par_iter().with_min_len(4096).for_each(|&[a, b, c]| {
-        joined.join(a, b);
-        joined.join(b, c);
-    });
-    (0..mesh.positions.len()).into_par_iter().with_min_len(4096).map(|v| joined.root(v as u32)).collect()
 }

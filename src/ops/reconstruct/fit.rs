@@ -5,7 +5,7 @@ use nalgebra::{Matrix6, Vector6};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use super::forces::{Term, View};
+use super::term::{Term, View};
 use crate::levelset::LevelSet;
 use crate::mesh::TriangleMesh;
 use crate::range::RangeMap;

@@ -4,7 +4,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use super::forces::{Term, View};
+use super::term::{Term, View};
 use crate::levelset::UnionFind;
 use crate::mesh::{TriangleMesh, linear_from_srgb8};
 
@@ -88,7 +88,8 @@ fn find(seen: &[bool], mesh: &TriangleMesh) -> Holes {
         let hole = holes.entry(joined.root(mesh.triangles[t][0])).or_default();
         (hole.0, hole.1) = (hole.0 + area, hole.1 + (a + b + c) * (area / 3.0));
     }
-    let area: f64 = holes.values().map(|hole| hole.0).sum();
+    // The sum of nothing would be −0.
+    let area = holes.values().fold(0.0, |sum, hole| sum + hole.0);
     let mut largest: Vec<(f64, DVec3)> = holes.into_values().filter(|hole| hole.0 > 0.0).collect();
     largest.sort_by(|a, b| b.0.total_cmp(&a.0));
     largest.truncate(LISTED);

@@ -1,7 +1,8 @@
 use glam::{DAffine3, DMat3, DVec2};
 
+use super::term::View;
 use super::*;
-use crate::mesh::level_set_to_mesh;
+use crate::mesh::level_set_of_mesh;
 use crate::range::{Background, Projection};
 
 const MAJOR: f64 = 1.0 / 0.0425;
@@ -336,7 +337,8 @@ fn the_force_is_that_of_the_energy_at_any_slope() {
         };
         let rate = (energy(-1e-4) - energy(1e-4)) / 2e-4;
         let terms = [Term::new(&map, width, 1.0, None, f64::INFINITY)];
-        let forces = Forces::new(&terms, transform, &run);
+        let measurements = Measurements::new(&terms, transform, 3.0, &run);
+        let forces = Forces::new(&measurements);
         let step = 0.25;
         let mut control = |moment: &Moment| (moment.steps == 0).then_some(step);
         move_surface(&mut surface, &forces, 0.0, 0.0, 1, &mut control, &run).unwrap();
@@ -367,7 +369,14 @@ fn the_gate_takes_away_what_maps_of_the_other_side_push() {
             normals.push(n);
         }
     }
-    let views: Vec<_> = terms.iter().map(|term| term.views(&points, &normals)).collect();
+    // A view says nothing of what faces away: there it is asked with the normal turned round.
+    let behind: Vec<DVec3> = normals.iter().map(|n| -*n).collect();
+    let both = |term: &Term| -> Vec<View> {
+        let turned = term.views(&points, &behind).into_iter().map(|view| View { cosine: -view.cosine, ..view });
+        let pairs = term.views(&points, &normals).into_iter().zip(turned);
+        pairs.map(|(front, back)| if front.cosine > 0.0 { front } else { back }).collect()
+    };
+    let views: Vec<Vec<View>> = terms.iter().map(both).collect();
     // Where the force would be at rest, to first order, in the mean over points.
     let shift = |gate: &dyn Fn(f64) -> f64| {
         let at = |i: usize| {
@@ -390,7 +399,8 @@ fn the_gate_takes_away_what_maps_of_the_other_side_push() {
     // The first surface, by the same maps.
     let run = RunOptions::default();
     let bounds = (glam::IVec3::splat(-42), glam::IVec3::splat(42));
-    let first = Forces::new(&terms, Transform::uniform(1.0), &run).first_surface(3.0, bounds, &run).unwrap();
+    let measurements = Measurements::new(&terms, Transform::uniform(1.0), 3.0, &run);
+    let first = measurements.first_surface(3.0, bounds, &run).unwrap();
     let (rms, mean) = error(&first, torus);
     println!("first surface: rms {rms:.3} mean {mean:+.3}");
     assert!(rms < 0.35, "{rms}");
