@@ -214,7 +214,7 @@ const EXAMPLES: &[Example] = &[
             "vdb-edit convert assets/spot.obj -o spot.vdb --resolution 128",
             "vdb-edit dilate spot.vdb -o little.vdb --distance 0.05",
             "vdb-edit dilate spot.vdb -o much.vdb --distance 0.1",
-            "vdb-edit render spot.vdb little.vdb much.vdb -o dilate.png --columns 3 --size 260x220 --camera 200,15",
+            "vdb-edit render spot.vdb little.vdb much.vdb -o dilate.png --columns 3 --size 250x210 --camera 200,15",
         ],
     },
     Example {
