@@ -18,7 +18,7 @@ use crate::grid::Accessor;
 const BENT: f32 = 0.2;
 
 /// Or the square of their mean is below this: where an edge crosses parallel edges of the cell alike, none differs from the others, but
-/// gradients cancel. At a surface with a radius of 3 voxels it is above 0.95.
+/// gradients cancel. Balls of a radius of 3.3 voxels and cylinders of 3 stay above it (0.934 and 0.950 in the worst of 60,000 places).
 const SHORT: f32 = 0.93;
 
 /// How far a gradient may be from 1.

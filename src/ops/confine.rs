@@ -232,7 +232,8 @@ impl Changed {
     /// Whether a box of 4, 8, 16 or 32 voxels holds any of it.
     fn touches(&self, first: IVec3, last: IVec3) -> bool {
         let edge = last.x - first.x + 1;
-        let level = (edge / Self::CUBE).ilog2() as usize;
+        // What is smaller than a cube is judged by the cube.
+        let (edge, level) = (edge.max(Self::CUBE), (edge / Self::CUBE).max(1).ilog2() as usize);
         self.boxes.get(level).is_none_or(|boxes| boxes.contains(&first.div_euclid(IVec3::splat(edge))))
     }
 }
