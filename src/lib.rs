@@ -72,6 +72,7 @@
 #![warn(missing_docs)]
 
 pub mod atomic;
+mod awake;
 #[cfg(feature = "cli")]
 pub mod cli;
 #[cfg(feature = "openvdb")]

@@ -61,13 +61,15 @@ pub(super) struct Topology {
     neighbours: Vec<OnceLock<Arc<NeighbourPage>>>,
 }
 
-/// Sort key of origins: x, then y, then z.
-pub(super) fn key(origin: IVec3) -> (i32, i32, i32) {
-    (origin.x, origin.y, origin.z)
+/// Sort key of origins: x, then y, then z. One number, as comparing three in turn is mostly waiting for branches guessed wrong.
+pub(super) fn key(origin: IVec3) -> u128 {
+    // The order of the signed numbers as that of unsigned ones.
+    let [x, y, z] = origin.to_array().map(|v| u128::from(v.cast_unsigned() ^ 1 << 31));
+    x << 64 | y << 32 | z
 }
 
 /// Sort key of slots: node by node, along a Z-order curve in each.
-fn block_key(origin: IVec3) -> ((i32, i32, i32), u32) {
+fn block_key(origin: IVec3) -> (u128, u32) {
     // Bits 0 to 3 to places 0, 3, 6, 9.
     let spread = |v: i32| {
         let v = (v & (NODE_LEAVES - 1)) as u32;
@@ -205,17 +207,7 @@ impl Topology {
             added.push((id, set_entry(&mut self.nodes, origin, id)));
         }
         self.merge_order(&added);
-        let mut table = std::mem::take(&mut self.neighbours);
-        table.resize_with(self.page_count(), OnceLock::new);
-        let mut cache = NodeCache::default();
-        for &(id, _) in &added {
-            let around = self.neighbours_of(id, &mut cache);
-            if let Some(page) = table[id.page()].get_mut() {
-                Arc::make_mut(page)[id.slot()] = around;
-            }
-            relink(&mut table, &around, id);
-        }
-        self.neighbours = table;
+        self.relink(&added, |id, _| id);
         added
     }
 
@@ -230,11 +222,33 @@ impl Topology {
             self.free.push(id);
         }
         self.order.retain(|id| self.live.contains(*id));
+        self.relink(removed, |_, sentinel| sentinel);
+    }
+
+    /// Leaves have come or gone: tells all around each of them whose neighbours are known, and itself, that `entry(leaf, sentinel)` now
+    /// lies at its place.
+    fn relink(&mut self, changed: &[(LeafId, LeafId)], entry: impl Fn(LeafId, LeafId) -> LeafId) {
         let mut table = std::mem::take(&mut self.neighbours);
-        let mut cache = NodeCache::default();
-        for &(id, sentinel) in removed {
-            let around = self.neighbours_of(id, &mut cache);
-            relink(&mut table, &around, sentinel);
+        table.resize_with(self.page_count(), OnceLock::new);
+        let mut pages: Vec<KnownPage> = table.iter_mut().map(|page| KnownPage::Shared(page.get_mut())).collect();
+        let around = |changed: &[(LeafId, LeafId)]| -> Vec<Neighbours> {
+            let mut cache = NodeCache::default();
+            changed.iter().map(|(id, _)| self.neighbours_of(*id, &mut cache)).collect()
+        };
+        let around: Vec<_> = changed.par_chunks(RELINK_LEAVES).map(around).collect();
+        for (&(id, sentinel), around) in changed.iter().zip(around.iter().flatten()) {
+            let entry = entry(id, sentinel);
+            if let Some(page) = pages[id.page()].own() {
+                page[id.slot()] = *around;
+            }
+            for (q, &n) in around.iter().enumerate() {
+                if q != 13
+                    && !n.is_sentinel()
+                    && let Some(page) = pages[n.page()].own()
+                {
+                    page[n.slot()][26 - q] = entry;
+                }
+            }
         }
         self.neighbours = table;
     }
@@ -276,27 +290,25 @@ impl Topology {
 
     fn neighbours_of<'a>(&'a self, id: LeafId, cache: &mut NodeCache<'a>) -> Neighbours {
         let origin = self.origin(id);
-        let tables = cache.around(self, node_of(origin));
+        cache.enter(node_of(origin));
         let local: IVec3 = (origin >> 3) & (NODE_LEAVES - 1);
-        if let Some(table) = tables[13]
-            && local.min_element() > 0
-            && local.max_element() < NODE_LEAVES - 1
-        {
-            // All in one table: nine runs of three along z.
-            let first = entry_of_leaf(local - 1);
-            let mut around = [LeafId::OUTSIDE; 27];
-            for (run, entries) in around.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                entries.copy_from_slice(&table[first + ((run / 3) << 8) + ((run % 3) << 4)..][..3]);
+        let mut around = [LeafId::OUTSIDE; 27];
+        let one_table = 0 < local.z && local.z < NODE_LEAVES - 1;
+        // Nine runs of three along z. A leaf's place shifted by 4 is −1, 0 or 1 for the node below, this one, the node above.
+        for (run, entries) in around.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+            let leaf = local + IVec3::new(run as i32 / 3 - 1, run as i32 % 3 - 1, 0);
+            if one_table {
+                if let Some(table) = cache.table(self, leaf >> 4) {
+                    entries.copy_from_slice(&table[entry_of_leaf(leaf) - 1..][..3]);
+                }
+            } else {
+                for (z, entry) in (leaf.z - 1..).zip(entries) {
+                    let leaf = leaf.with_z(z);
+                    *entry = cache.table(self, leaf >> 4).map_or(LeafId::OUTSIDE, |table| table[entry_of_leaf(leaf)]);
+                }
             }
-            return around;
         }
-        std::array::from_fn(|q| {
-            let leaf = local + neighbour_step(q);
-            // -1, 0 or 1 for the node below, this one, the node above.
-            let node = leaf >> 4;
-            let table = tables[neighbour_index(node)];
-            table.map_or(LeafId::OUTSIDE, |t| t[entry_of_leaf(leaf)])
-        })
+        around
     }
 
     /// Gives all absent leaves in the box of leaf origins `lo..hi` (exclusive) the sign `inside`.
@@ -451,14 +463,25 @@ fn set_entry(nodes: &mut FxHashMap<IVec3, Arc<NodeTable>>, origin: IVec3, id: Le
     std::mem::replace(&mut Arc::make_mut(table)[entry_of(origin)], id)
 }
 
-/// Tells every leaf of `around` whose neighbours are known that `entry` now lies in the middle.
-fn relink(table: &mut [OnceLock<Arc<NeighbourPage>>], around: &Neighbours, entry: LeafId) {
-    for (q, &n) in around.iter().enumerate() {
-        if q != 13
-            && !n.is_sentinel()
-            && let Some(page) = table[n.page()].get_mut()
-        {
-            Arc::make_mut(page)[n.slot()][26 - q] = entry;
+/// Leaves whose neighbours one task looks up.
+const RELINK_LEAVES: usize = 128;
+
+/// Neighbours of a page's leaves, if they are known. Asking an `Arc` whether it is shared takes longer than an entry, so it is asked once.
+enum KnownPage<'a> {
+    Shared(Option<&'a mut Arc<NeighbourPage>>),
+    Own(&'a mut NeighbourPage),
+}
+
+impl KnownPage<'_> {
+    /// The page for writing, copied first if it is shared.
+    #[inline(always)]
+    fn own(&mut self) -> Option<&mut NeighbourPage> {
+        if let Self::Shared(page) = self {
+            *self = Self::Own(Arc::make_mut(page.take()?));
+        }
+        match self {
+            Self::Own(page) => Some(page),
+            Self::Shared(_) => None,
         }
     }
 }
@@ -476,11 +499,6 @@ fn for_each_origin(lo: IVec3, hi: IVec3, mut f: impl FnMut(IVec3)) {
 /// Index in [`Neighbours`] of the neighbour at `step` (each component −1, 0 or 1).
 pub fn neighbour_index(step: IVec3) -> usize {
     ((step.x + 1) * 9 + (step.y + 1) * 3 + step.z + 1) as usize
-}
-
-fn neighbour_step(index: usize) -> IVec3 {
-    let q = index as i32;
-    IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1)
 }
 
 /// Walks the leaves of a topology in order, and knows the sign of other places on the way.
@@ -530,27 +548,43 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// The tables around the last node asked for: leaves come in runs of one node.
+/// The tables around the last node entered, as far as they were asked for: leaves come in runs of one node, and most of them need no
+/// other table than their own.
 #[derive(Default)]
 struct NodeCache<'a> {
-    centre: Option<IVec3>,
+    centre: IVec3,
     tables: [Option<&'a NodeTable>; 27],
+    /// A bit for each of `tables` that was looked up.
+    known: u32,
 }
 
 impl<'a> NodeCache<'a> {
-    fn around(&mut self, topology: &'a Topology, node: IVec3) -> &[Option<&'a NodeTable>; 27] {
-        if self.centre != Some(node) {
-            self.centre = Some(node);
-            self.tables =
-                std::array::from_fn(|q| topology.nodes.get(&(node + neighbour_step(q))).map(|table| &**table));
+    fn enter(&mut self, node: IVec3) {
+        if self.centre != node {
+            *self = Self { centre: node, ..Self::default() };
         }
-        &self.tables
+    }
+
+    /// The table of the node at `step` from the one entered; `None` if it has none.
+    #[inline(always)]
+    fn table(&mut self, topology: &'a Topology, step: IVec3) -> Option<&'a NodeTable> {
+        let q = neighbour_index(step);
+        if self.known >> q & 1 == 0 {
+            self.known |= 1 << q;
+            self.tables[q] = topology.nodes.get(&(self.centre + step)).map(|table| &**table);
+        }
+        self.tables[q]
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn neighbour_step(index: usize) -> IVec3 {
+        let q = index as i32;
+        IVec3::new(q / 9 - 1, q / 3 % 3 - 1, q % 3 - 1)
+    }
 
     fn sorted(mut origins: Vec<IVec3>) -> Vec<IVec3> {
         origins.sort_unstable_by_key(|o| key(*o));

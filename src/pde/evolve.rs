@@ -4,6 +4,7 @@ use super::rest::Watch;
 use super::speed::{FlowStep, SpeedFunction};
 use super::step::Target;
 use super::{SolverOptions, TimeIntegrator, Tracker};
+use crate::awake::awake;
 use crate::error::{EditError, Result};
 use crate::grid::{Grid, LeafValues};
 use crate::levelset::LevelSet;
@@ -98,8 +99,7 @@ pub(super) fn drive(tracker: &mut Tracker, motion: &mut impl Motion, until: Unti
         }
         let steps_left = if end.is_finite() { (left / dt).ceil() as u32 } else { most - report.steps };
         let task = task.get_or_insert_with(|| run.task("evolving", u64::from(steps_left)));
-        motion.step(tracker, dt)?;
-        tracker.track()?;
+        awake(|| motion.step(tracker, dt).and_then(|()| tracker.track()))?;
         report.steps += 1;
         // Not the sum of the steps, which rounding may leave short of the end.
         report.time = if dt == left { end } else { report.time + dt };

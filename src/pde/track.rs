@@ -5,6 +5,7 @@ use rayon::prelude::*;
 use super::SolverOptions;
 use super::step::{Emptied, Target};
 use super::tracker::Tracker;
+use crate::awake::awake;
 use crate::error::Result;
 use crate::grid::{Face, LeafId, LeafMask, LeafSet, Paged, neighbour_index};
 use crate::levelset::LevelSet;
@@ -12,7 +13,7 @@ use crate::run::RunOptions;
 
 /// Dilates, renormalises and trims the whole band once.
 pub fn track(level_set: &mut LevelSet, solver: &SolverOptions, run: &RunOptions) -> Result<()> {
-    Tracker::new(level_set, None, *solver, run).track()
+    awake(|| Tracker::new(level_set, None, *solver, run).track())
 }
 
 impl Tracker<'_> {

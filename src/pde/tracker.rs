@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::domain::Domain;
 use super::step::{Blend, LeafKernel, Target};
 use super::{SolverOptions, TimeIntegrator};
+use crate::awake::awake;
 use crate::error::Result;
 use crate::grid::{Grid, LeafSet, LeafValues, PageLeaves, Paged, Transform};
 use crate::levelset::LevelSet;
@@ -40,7 +41,7 @@ impl<'a> Tracker<'a> {
         let grid = level_set.grid_mut();
         let domain = match region {
             None => Domain::everywhere(grid),
-            Some(region) => Domain::region(grid, RegionWeights::new(grid, &transform, region)),
+            Some(region) => awake(|| Domain::region(grid, RegionWeights::new(grid, &transform, region))),
         };
         Self { grid, transform, domain, region, buffers: Vec::new(), solver, run }
     }
