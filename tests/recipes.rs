@@ -601,6 +601,27 @@ fn only_steps_that_a_change_affects_run_again() {
 }
 
 #[test]
+fn of_a_mesh_only_the_leaves_that_an_edit_changed_are_polygonised() {
+    let text = format!("{EDITED}[[step]]\nop = \"write\"\ninput = \"smoothed\"\npath = \"smoothed.ply\"\n");
+    let more = text.replace("iterations = 2", "iterations = 9");
+    let [desk, fresh] = [Desk::new(), Desk::new()];
+    let results = &mut vdb_edit::recipe::Results::default();
+    let polygonised = |desk: &Desk, text: &str, results: &mut vdb_edit::recipe::Results| {
+        let recipe = vdb_edit::recipe::Recipe::parse(text, &desk.path("r.toml")).unwrap();
+        let run = vdb_edit::run::RunOptions::default();
+        let done = recipe.plan(&[]).unwrap()[0].rerun(results, &run, &mut |_| {}).unwrap();
+        results.forget_unused();
+        done.steps.last().unwrap().summary.details["leaves_polygonised"].as_u64().unwrap()
+    };
+    polygonised(&desk, &text, results);
+    let part = polygonised(&desk, &more, results);
+    let all = polygonised(&fresh, &more, &mut vdb_edit::recipe::Results::default());
+    assert!(0 < part && part < all / 2, "{part} of {all}");
+    let [again, fresh] = [&desk, &fresh].map(|desk| std::fs::read(desk.path("smoothed.ply")).unwrap());
+    assert!(again == fresh);
+}
+
+#[test]
 fn without_room_steps_run_again_with_the_same_result() {
     let desk = Desk::new();
     let results = &mut vdb_edit::recipe::Results::within(Some(0));

@@ -1,5 +1,6 @@
 //! How a result becomes a mesh file: which faces, how many, and what their vertices carry.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value};
@@ -9,8 +10,7 @@ use super::output::Written;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{
-    self, Attributes, Bound, MeshFormat, TriangleMesh, level_set_to_mesh, level_set_to_quads, simplify,
-    transfer_attributes,
+    self, Attributes, Bound, MeshFormat, Remesh, TriangleMesh, level_set_to_quads, simplify, transfer_attributes,
 };
 use crate::run::RunOptions;
 
@@ -143,10 +143,18 @@ impl MeshOptions {
         })
     }
 
-    /// Writes the surface φ = `iso`.
-    pub fn write_level_set(&self, path: &Path, level_set: &LevelSet, iso: f32, run: &RunOptions) -> Result<Written> {
+    /// Writes the surface φ = `iso`. Triangles are taken from the `last` mesh as far as they are the same.
+    pub fn write_level_set(
+        &self,
+        path: &Path,
+        level_set: &LevelSet,
+        iso: f32,
+        last: &mut Remesh,
+        run: &RunOptions,
+    ) -> Result<Written> {
         if self.faces != Faces::Quads {
-            return self.write_triangles(path, level_set_to_mesh(level_set, iso, run)?, level_set.voxel_size(), run);
+            let mesh = Cow::Borrowed(last.level_set_to_mesh(level_set, iso, run)?);
+            return self.write_triangles(path, mesh, level_set.voxel_size(), run);
         }
         let mut mesh = level_set_to_quads(level_set, iso, run)?;
         if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, run)? {
@@ -164,13 +172,13 @@ impl MeshOptions {
 
     /// Writes a mesh that came from a file.
     pub fn write_mesh(&self, path: &Path, mesh: TriangleMesh, run: &RunOptions) -> Result<Written> {
-        self.write_triangles(path, mesh, 1.0, run)
+        self.write_triangles(path, Cow::Owned(mesh), 1.0, run)
     }
 
     fn write_triangles(
         &self,
         path: &Path,
-        mut mesh: TriangleMesh,
+        mut mesh: Cow<'_, TriangleMesh>,
         voxel_size: f64,
         run: &RunOptions,
     ) -> Result<Written> {
@@ -186,9 +194,10 @@ impl MeshOptions {
             details.insert("triangles_before".into(), mesh.triangles.len().into());
             details.insert("deviation".into(), simplified.deviation.into());
             warnings.extend(simplified.warnings);
-            mesh = simplified.mesh;
+            mesh = Cow::Owned(simplified.mesh);
         }
         if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, run)? {
+            let mesh = mesh.to_mut();
             (mesh.colors, mesh.uvs) = (colors, uvs);
         }
         mesh::write(path, &mesh)?;

@@ -11,7 +11,7 @@ use super::volume::{self, Volume};
 use crate::atomic;
 use crate::error::{EditError, Result};
 use crate::levelset::{Field, LevelSet};
-use crate::mesh::{MeshFormat, TriangleMesh, level_set_to_mesh};
+use crate::mesh::{MeshFormat, Remesh, TriangleMesh, level_set_to_mesh};
 use crate::run::RunOptions;
 
 /// A file to be written.
@@ -100,13 +100,25 @@ impl Output {
         from: Option<(&Volume, Option<usize>)>,
         run: &RunOptions,
     ) -> Result<Written> {
+        self.write_again(level_set, iso, from, &mut Remesh::default(), run)
+    }
+
+    /// The same; a mesh takes of the `last` one written there what has not changed.
+    pub fn write_again(
+        &self,
+        level_set: &LevelSet,
+        iso: f32,
+        from: Option<(&Volume, Option<usize>)>,
+        last: &mut Remesh,
+        run: &RunOptions,
+    ) -> Result<Written> {
         run.check("writing")?;
         match self.kind {
             Kind::Volume => {
                 let (bytes, warnings) = volume::write(&self.path, level_set, None, from, &self.options)?;
                 Ok(Written { bytes: Some(bytes), warnings, ..Written::default() })
             }
-            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, iso, run),
+            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, iso, last, run),
         }
     }
 
@@ -132,7 +144,7 @@ impl Output {
                 mesh.colors = Some(colors(&mesh.positions)?);
                 self.mesh.write_mesh(&self.path, mesh, run)
             }
-            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, 0.0, run),
+            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, 0.0, &mut Remesh::default(), run),
         }
     }
 

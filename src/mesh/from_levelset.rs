@@ -4,10 +4,13 @@
 //! in `levelset::marching`). Vertices lie on grid edges by linear interpolation: within κ h²/8 of the true surface
 //! where φ is a distance. Numbers of vertices and triangles go by the order of leaves, not by threads.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use glam::DVec3;
 use rayon::prelude::*;
 
 use super::TriangleMesh;
+use super::remesh::{Last, Places, places};
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::levelset::isosurface::{CellVertices, IsoSurface, MEMORY_ADVICE, SurfaceLeaf};
@@ -22,6 +25,16 @@ const OPERATION: &str = "level set to mesh";
 /// Refused where the surface leaves the stored band: such a mesh would have holes. Surfaces that lie between absent
 /// leaves altogether are not seen; [`LevelSet::check`] finds both.
 pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Result<TriangleMesh> {
+    polygonise(level_set, iso, None, run).map(|(mesh, ..)| mesh)
+}
+
+/// The mesh, where its leaves have their parts of it, and the number of leaves that were not taken from the `last` one.
+pub(super) fn polygonise(
+    level_set: &LevelSet,
+    iso: f32,
+    last: Option<&Last>,
+    run: &RunOptions,
+) -> Result<(TriangleMesh, Places, usize)> {
     let surface = surface_of(level_set, iso, OPERATION, run)?;
     let leaves = surface.leaves();
     let triangle_count: usize = leaves.iter().map(|leaf| leaf.triangles as usize).sum();
@@ -34,11 +47,21 @@ pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Re
     // A mirrored transform turns the orientation round.
     let mirrored = transform.to_world().matrix3.determinant() < 0.0;
     let task = run.task(OPERATION, leaves.len() as u64);
+    let copied = AtomicUsize::new(0);
     let complete = split(leaves, &mut positions, &mut triangles)
         .into_par_iter()
         .with_min_len(16)
         .map_init(CellVertices::new, |vertices, (leaf, positions, triangles)| {
             if run.is_cancelled() {
+                return true;
+            }
+            if let Some(kept) = last.and_then(|last| last.kept(level_set.grid(), &surface, leaf)) {
+                positions.copy_from_slice(kept.positions);
+                for (triangle, kept_triangle) in triangles.iter_mut().zip(kept.triangles) {
+                    *triangle = kept_triangle.map(|vertex| vertex.wrapping_add(kept.shift));
+                }
+                copied.fetch_add(1, Ordering::Relaxed);
+                task.advance(1);
                 return true;
             }
             let mut slots = positions.iter_mut();
@@ -54,7 +77,8 @@ pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Re
         .all(|complete| complete);
     run.check(OPERATION)?;
     if complete {
-        Ok(TriangleMesh { positions, triangles, ..TriangleMesh::default() })
+        let mesh = TriangleMesh { positions, triangles, ..TriangleMesh::default() };
+        Ok((mesh, places(level_set.grid(), &surface), leaves.len() - copied.into_inner()))
     } else {
         Err(leaves_the_band(OPERATION, "between leaves"))
     }

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use super::run::{Slot, StepReport};
+use crate::mesh::Remesh;
 use crate::render::Redraw;
 
 /// When a file was changed last, and its size; `None` if it is not there.
@@ -36,7 +37,7 @@ pub(super) struct Key {
 /// Stands for a key; the same for the same one.
 pub(super) type Identity = u64;
 
-/// The results of the steps of a recipe, and its pictures. Each run forgets what it did not use.
+/// The results of the steps of a recipe, its pictures and meshes. Each run forgets what it did not use.
 #[derive(Default)]
 pub struct Results {
     /// What stands for each key, and whether it was asked for.
@@ -45,6 +46,8 @@ pub struct Results {
     steps: HashMap<Identity, Made>,
     /// The last pictures of each file, one an input, and whether they were asked for.
     pictures: HashMap<PathBuf, (Vec<Redraw>, bool)>,
+    /// The last mesh of each file, and whether it was asked for.
+    meshes: HashMap<PathBuf, (Remesh, bool)>,
     /// Most bytes of results that are kept; all if not given.
     most: Option<u64>,
 }
@@ -94,7 +97,8 @@ impl Results {
     fn has_room(&self, bytes: u64) -> bool {
         let steps = self.steps.values().map(|made| made.bytes);
         let pictures = self.pictures.values().flat_map(|(pictures, _)| pictures).map(Redraw::bytes);
-        self.most.is_none_or(|most| steps.chain(pictures).fold(bytes, u64::saturating_add) <= most)
+        let meshes = self.meshes.values().map(|(mesh, _)| mesh.bytes());
+        self.most.is_none_or(|most| steps.chain(pictures).chain(meshes).fold(bytes, u64::saturating_add) <= most)
     }
 
     /// Has something done with the last pictures of a file.
@@ -107,10 +111,23 @@ impl Results {
         drawn
     }
 
-    /// Notes that the last pictures of a file are still those that are wanted.
-    pub(super) fn keep_pictures(&mut self, path: &Path) {
+    /// Has something done with the last mesh of a file.
+    pub(super) fn with_mesh<T>(&mut self, path: &Path, write: impl FnOnce(&mut Remesh) -> T) -> T {
+        let (mut mesh, _) = self.meshes.remove(path).unwrap_or_default();
+        let written = write(&mut mesh);
+        if self.has_room(mesh.bytes()) {
+            self.meshes.insert(path.into(), (mesh, true));
+        }
+        written
+    }
+
+    /// Notes that the last pictures or the last mesh of a file are still those that are wanted.
+    pub(super) fn keep_last(&mut self, path: &Path) {
         if let Some(pictures) = self.pictures.get_mut(path) {
             pictures.1 = true;
+        }
+        if let Some(mesh) = self.meshes.get_mut(path) {
+            mesh.1 = true;
         }
     }
 
@@ -118,6 +135,7 @@ impl Results {
     pub fn forget_unused(&mut self) {
         self.steps.retain(|_, made| std::mem::take(&mut made.is_used));
         self.pictures.retain(|_, (_, is_used)| std::mem::take(is_used));
+        self.meshes.retain(|_, (_, is_used)| std::mem::take(is_used));
         self.identities.retain(|_, (_, is_used)| std::mem::take(is_used));
     }
 }

@@ -193,8 +193,10 @@ impl Plan<'_> {
                 slots[n] = made.slot.clone();
                 reports[n] = Some(StepReport { kept: true, seconds: 0.0, ..made.report.clone() });
             }
-            if let Action::Render(picture) = &planned.action {
-                results.keep_pictures(Path::new(&picture.path));
+            match &planned.action {
+                Action::Render(picture) => results.keep_last(Path::new(&picture.path)),
+                Action::Write(target) => results.keep_last(Path::new(&target.path)),
+                _ => {}
             }
         }
     }
@@ -245,14 +247,25 @@ impl Running<'_> {
                         output::verify("write", &slot.level_set)?;
                     }
                     let from = slot.source.as_ref().map(|source| (&source.0, source.1));
-                    let written = output.write(&slot.level_set, 0.0, from, self.run).map_err(|error| match error {
+                    let written = match &mut self.results {
+                        Some(results) if output.is_mesh() => results.with_mesh(path, |last| {
+                            let written = output.write_again(&slot.level_set, 0.0, from, last, self.run);
+                            // Quads are made as a whole.
+                            if last.bytes() > 0 {
+                                summary.details.insert("leaves_polygonised".into(), json!(last.made()));
+                            }
+                            written
+                        }),
+                        _ => output.write(&slot.level_set, 0.0, from, self.run),
+                    };
+                    let written = written.map_err(|error| match error {
                         EditError::Output { problem, .. } => EditError::output(path, problem),
                         error => error,
                     })?;
                     let lost = slot.attributes.iter().filter_map(|(mesh, what)| output.mesh().loss(mesh, what, path));
                     summary.warnings.extend(lost);
                     summary.warnings.extend(written.warnings);
-                    summary.details = written.details;
+                    summary.details.extend(written.details);
                     summary.details.insert("bytes".into(), json!(written.bytes));
                 }
                 (None, summary)
