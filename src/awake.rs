@@ -4,33 +4,37 @@
 //! sleep after a few microseconds without work, and to wake one takes as long as a good part of such a part: a step of a region of 200,000
 //! voxels took 2.5 to 3.5 ms with two threads, 2.0 ms with both awake.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// How long a thread looks for work before it may sleep. Beside a longer serial part, waking it takes next to nothing.
-const PATIENCE: Duration = Duration::from_micros(500);
+const PATIENCE: Duration = Duration::from_micros(200);
+
+/// Most threads that are kept awake: to call many takes longer than they could save.
+const MOST_THREADS: usize = 8;
 
 /// Whether some work keeps the threads awake already.
 static KEPT: AtomicBool = AtomicBool::new(false);
 
 /// Runs `work` on the calling thread. Meanwhile the other threads of rayon's pool look for what it hands out without going to sleep.
 pub fn awake<R>(work: impl FnOnce() -> R) -> R {
-    if rayon::current_num_threads() == 1 || KEPT.swap(true, Ordering::Relaxed) {
+    if !(2..=MOST_THREADS).contains(&rayon::current_num_threads()) || KEPT.swap(true, Ordering::Relaxed) {
         return work();
     }
-    let done = AtomicBool::new(false);
+    // Nobody waits for the others: one that is busy with something else comes when all is done, and leaves at once.
+    let done = Arc::new(AtomicBool::new(false));
     let caller = rayon::current_thread_index();
-    rayon::in_place_scope(|scope| {
-        scope.spawn_broadcast(|_, thread| {
-            // The caller may come by here while it waits for others.
-            if Some(thread.index()) != caller {
-                look_for_work(&done);
-            }
-        });
-        // The search ends when the work panics, too.
-        let _end = End(&done);
-        work()
-    })
+    let seen = done.clone();
+    rayon::spawn_broadcast(move |thread| {
+        // The caller comes by here while it waits for work that it handed out.
+        if Some(thread.index()) != caller {
+            look_for_work(&seen);
+        }
+    });
+    // The search ends when the work panics, too.
+    let _end = End(done);
+    work()
 }
 
 /// Does what there is to do until `done`, or until there has been nothing for long.
@@ -46,9 +50,9 @@ fn look_for_work(done: &AtomicBool) {
 }
 
 /// Says that the work is done.
-struct End<'a>(&'a AtomicBool);
+struct End(Arc<AtomicBool>);
 
-impl Drop for End<'_> {
+impl Drop for End {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
         KEPT.store(false, Ordering::Relaxed);

@@ -10,7 +10,8 @@ use super::output::Written;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::mesh::{
-    self, Attributes, Bound, MeshFormat, Remesh, TriangleMesh, level_set_to_quads, simplify, transfer_attributes,
+    self, Attributes, Bound, MeshFormat, Remesh, TriangleMesh, level_set_to_mesh, level_set_to_quads, simplify,
+    transfer_attributes,
 };
 use crate::run::RunOptions;
 
@@ -149,12 +150,18 @@ impl MeshOptions {
         path: &Path,
         level_set: &LevelSet,
         iso: f32,
-        last: &mut Remesh,
+        last: Option<&mut Remesh>,
         run: &RunOptions,
     ) -> Result<Written> {
         if self.faces != Faces::Quads {
-            let mesh = Cow::Borrowed(last.level_set_to_mesh(level_set, iso, run)?);
+            let mesh = match last {
+                Some(last) => Cow::Borrowed(last.level_set_to_mesh(level_set, iso, run)?),
+                None => Cow::Owned(level_set_to_mesh(level_set, iso, run)?),
+            };
             return self.write_triangles(path, mesh, level_set.voxel_size(), run);
+        }
+        if let Some(last) = last {
+            *last = Remesh::default();
         }
         let mut mesh = level_set_to_quads(level_set, iso, run)?;
         if let Some(Attributes { colors, uvs }) = self.attributes(&mesh.positions, run)? {

@@ -100,16 +100,16 @@ impl Output {
         from: Option<(&Volume, Option<usize>)>,
         run: &RunOptions,
     ) -> Result<Written> {
-        self.write_again(level_set, iso, from, &mut Remesh::default(), run)
+        self.write_again(level_set, iso, from, None, run)
     }
 
-    /// The same; a mesh takes of the `last` one written there what has not changed.
+    /// The same; a mesh takes of the `last` one written there what has not changed, if that is given.
     pub fn write_again(
         &self,
         level_set: &LevelSet,
         iso: f32,
         from: Option<(&Volume, Option<usize>)>,
-        last: &mut Remesh,
+        last: Option<&mut Remesh>,
         run: &RunOptions,
     ) -> Result<Written> {
         run.check("writing")?;
@@ -144,7 +144,7 @@ impl Output {
                 mesh.colors = Some(colors(&mesh.positions)?);
                 self.mesh.write_mesh(&self.path, mesh, run)
             }
-            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, 0.0, &mut Remesh::default(), run),
+            Kind::Mesh => self.mesh.write_level_set(&self.path, level_set, 0.0, None, run),
         }
     }
 

@@ -109,7 +109,7 @@ pub(crate) struct SurfaceLeaf {
     /// The crossed edges along each axis, by their first voxel.
     edges: [LeafMask; 3],
     /// Vertices of this leaf before each word of `edges`.
-    ranks: [u16; 24],
+    pub ranks: [u16; 24],
 }
 
 impl SurfaceLeaf {
@@ -206,6 +206,11 @@ impl<'a> IsoSurface<'a> {
     /// Place of a leaf among [`leaves`](Self::leaves); `None` for the sentinels and where the surface does not cross it.
     pub fn place(&self, id: LeafId) -> Option<usize> {
         self.places.get(id.index()).copied().filter(|&place| place != NO_SURFACE).map(|place| place as usize)
+    }
+
+    /// The leaves, and the place of each among them by slot, `u32::MAX` where there is none.
+    pub fn into_leaves(self) -> (Vec<SurfaceLeaf>, Vec<u32>) {
+        (self.leaves, self.places)
     }
 
     /// Number of vertices.

@@ -10,7 +10,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::TriangleMesh;
-use super::remesh::{Last, Places, places};
+use super::remesh::Last;
 use crate::error::{EditError, Result};
 use crate::levelset::LevelSet;
 use crate::levelset::isosurface::{CellVertices, IsoSurface, MEMORY_ADVICE, SurfaceLeaf};
@@ -25,16 +25,21 @@ const OPERATION: &str = "level set to mesh";
 /// Refused where the surface leaves the stored band: such a mesh would have holes. Surfaces that lie between absent
 /// leaves altogether are not seen; [`LevelSet::check`] finds both.
 pub fn level_set_to_mesh(level_set: &LevelSet, iso: f32, run: &RunOptions) -> Result<TriangleMesh> {
-    polygonise(level_set, iso, None, run).map(|(mesh, ..)| mesh)
+    polygonise(level_set, iso, None, run).map(|polygons| polygons.mesh)
 }
 
-/// The mesh, where its leaves have their parts of it, and the number of leaves that were not taken from the `last` one.
-pub(super) fn polygonise(
-    level_set: &LevelSet,
-    iso: f32,
-    last: Option<&Last>,
-    run: &RunOptions,
-) -> Result<(TriangleMesh, Places, usize)> {
+/// A mesh, and what the next one needs to know of it.
+pub(super) struct Polygons {
+    pub mesh: TriangleMesh,
+    /// The leaves that the surface crosses, and the place of each among them by slot.
+    pub leaves: Vec<SurfaceLeaf>,
+    pub places: Vec<u32>,
+    /// How many of them were not taken from the last mesh.
+    pub made: usize,
+}
+
+/// As [`level_set_to_mesh`]; what is the same as in the `last` mesh is copied from it.
+pub(super) fn polygonise(level_set: &LevelSet, iso: f32, last: Option<&Last>, run: &RunOptions) -> Result<Polygons> {
     let surface = surface_of(level_set, iso, OPERATION, run)?;
     let leaves = surface.leaves();
     let triangle_count: usize = leaves.iter().map(|leaf| leaf.triangles as usize).sum();
@@ -78,7 +83,9 @@ pub(super) fn polygonise(
     run.check(OPERATION)?;
     if complete {
         let mesh = TriangleMesh { positions, triangles, ..TriangleMesh::default() };
-        Ok((mesh, places(level_set.grid(), &surface), leaves.len() - copied.into_inner()))
+        let made = leaves.len() - copied.into_inner();
+        let (leaves, places) = surface.into_leaves();
+        Ok(Polygons { mesh, leaves, places, made })
     } else {
         Err(leaves_the_band(OPERATION, "between leaves"))
     }

@@ -1,15 +1,15 @@
 //! A mesh made again after an edit: only the leaves that the edit changed.
 //!
 //! The vertices and triangles of a leaf depend on the values of its voxels and of those in the seven leaves above it along the axes, which its cells
-//! reach into. Where these are the same bits as before, they are copied; the numbers of the vertices grow by as much as came before them. So the
-//! mesh is that of [`level_set_to_mesh`](super::level_set_to_mesh), to the bit.
+//! reach into, and on how these eight leaves number their vertices: one of them may have more or fewer before those that the leaf uses, because of a
+//! ninth leaf. Where all this is as before, they are copied; the numbers of the vertices grow by as much as came before them. So the mesh is that of
+//! [`level_set_to_mesh`](super::level_set_to_mesh), to the bit.
 
 use glam::{DVec3, IVec3};
-use rustc_hash::FxHashMap;
 
 use super::TriangleMesh;
-use super::from_levelset::polygonise;
-use crate::error::Result;
+use super::from_levelset::{Polygons, polygonise};
+use crate::error::{EditError, Result};
 use crate::grid::{Grid, LEAF_DIM, LeafId, neighbour_index};
 use crate::levelset::LevelSet;
 use crate::levelset::isosurface::{IsoSurface, SurfaceLeaf, corner};
@@ -27,10 +27,25 @@ impl Remesh {
     /// As [`level_set_to_mesh`](super::level_set_to_mesh).
     pub fn level_set_to_mesh(&mut self, level_set: &LevelSet, iso: f32, run: &RunOptions) -> Result<&TriangleMesh> {
         let is_same = |last: &Last| last.iso == iso && last.level_set.transform() == level_set.transform();
-        let last = self.last.take().filter(is_same);
-        let (mesh, leaves, made) = polygonise(level_set, iso, last.as_ref(), run)?;
+        let last = std::mem::take(self).last.filter(is_same);
+        let made = match polygonise(level_set, iso, last.as_ref(), run) {
+            // There may be room for one mesh where there is none for two.
+            Err(EditError::Memory { .. }) if last.is_some() => {
+                drop(last);
+                polygonise(level_set, iso, None, run)
+            }
+            made => made,
+        };
+        let Polygons { mesh, leaves, places, made } = made?;
         self.made = made;
-        Ok(&self.last.insert(Last { level_set: level_set.clone(), iso, mesh, leaves }).mesh)
+        let mut triangles = 0;
+        let first_triangle = |leaf: &SurfaceLeaf| {
+            triangles += leaf.triangles as usize;
+            triangles - leaf.triangles as usize
+        };
+        let first_triangles = leaves.iter().map(first_triangle).collect();
+        let last = Last { level_set: level_set.clone(), iso, mesh, leaves, places, first_triangles };
+        Ok(&self.last.insert(last).mesh)
     }
 
     /// Leaves that were polygonised for the last mesh; the others were copied.
@@ -38,12 +53,17 @@ impl Remesh {
         self.made
     }
 
+    /// Whether there is a mesh to take something from.
+    pub fn is_empty(&self) -> bool {
+        self.last.is_none()
+    }
+
     /// Bytes held, those of the level set's pages included.
     pub fn bytes(&self) -> u64 {
         self.last.as_ref().map_or(0, |last| {
             let mesh = size_of_val(&last.mesh.positions[..]) + size_of_val(&last.mesh.triangles[..]);
-            let leaves = last.leaves.capacity() * size_of::<(IVec3, Place)>();
-            last.level_set.grid().bytes() + (mesh + leaves) as u64
+            let leaves = size_of_val(&last.leaves[..]) + size_of_val(&last.first_triangles[..]);
+            last.level_set.grid().bytes() + (mesh + leaves + size_of_val(&last.places[..])) as u64
         })
     }
 }
@@ -53,28 +73,12 @@ pub(super) struct Last {
     level_set: LevelSet,
     iso: f32,
     mesh: TriangleMesh,
-    leaves: Places,
-}
-
-/// Where the vertices and triangles of each leaf are, by its origin.
-pub(super) type Places = FxHashMap<IVec3, Place>;
-
-/// Where the vertices and triangles of a leaf are.
-#[derive(Clone, Copy)]
-pub(super) struct Place {
-    first_vertex: u32,
-    first_triangle: usize,
-}
-
-/// Where the leaves of a surface have theirs.
-pub(super) fn places(grid: &Grid, surface: &IsoSurface) -> Places {
-    let mut first_triangle = 0;
-    let place = |leaf: &SurfaceLeaf| {
-        let place = Place { first_vertex: leaf.first_vertex, first_triangle };
-        first_triangle += leaf.triangles as usize;
-        (grid.origin(leaf.id), place)
-    };
-    surface.leaves().iter().map(place).collect()
+    /// Those that the surface crossed.
+    leaves: Vec<SurfaceLeaf>,
+    /// The place of each among them, by slot.
+    places: Vec<u32>,
+    /// The first triangle of each.
+    first_triangles: Vec<usize>,
 }
 
 /// What a leaf had in the last mesh.
@@ -89,24 +93,33 @@ impl Last {
     /// What a leaf had, if it has the same now.
     pub fn kept(&self, grid: &Grid, surface: &IsoSurface, leaf: &SurfaceLeaf) -> Option<Kept<'_>> {
         let (was, origin) = (self.level_set.grid(), grid.origin(leaf.id));
-        let place = self.leaves.get(&origin)?;
-        let shift = leaf.first_vertex.wrapping_sub(place.first_vertex);
+        let old = self.leaf(was.find(origin))?;
+        let shift = leaf.first_vertex.wrapping_sub(old.first_vertex);
         let around = &grid.neighbours()[leaf.id.index()];
         let is_same = |step: IVec3| {
-            let (id, origin) = (around[neighbour_index(step)], origin + step * LEAF_DIM);
-            let first_vertex = surface.place(id).map(|at| surface.leaves()[at].first_vertex.wrapping_sub(shift));
-            first_vertex == self.leaves.get(&origin).map(|place| place.first_vertex)
-                && same_values(grid, id, was, was.find(origin))
+            let (new, old) = (around[neighbour_index(step)], was.find(origin + step * LEAF_DIM));
+            let same_numbers = match (surface.place(new).map(|place| &surface.leaves()[place]), self.leaf(old)) {
+                (Some(new), Some(old)) => {
+                    new.first_vertex == old.first_vertex.wrapping_add(shift) && new.ranks == old.ranks
+                }
+                (new, old) => new.is_none() && old.is_none(),
+            };
+            same_numbers && same_values(grid, new, was, old)
         };
         if !(0..8).all(|c| is_same(corner(c))) {
             return None;
         }
-        let (vertex, triangle) = (place.first_vertex as usize, place.first_triangle);
+        let place = *self.places.get(old.id.index())? as usize;
+        let (vertex, triangle) = (old.first_vertex as usize, *self.first_triangles.get(place)?);
         Some(Kept {
             positions: self.mesh.positions.get(vertex..vertex + leaf.vertices as usize)?,
             triangles: self.mesh.triangles.get(triangle..triangle + leaf.triangles as usize)?,
             shift,
         })
+    }
+
+    fn leaf(&self, id: LeafId) -> Option<&SurfaceLeaf> {
+        self.leaves.get(*self.places.get(id.index())? as usize)
     }
 }
 
@@ -121,7 +134,8 @@ mod tests {
     use super::super::level_set_to_mesh;
     use super::*;
     use crate::grid::LeafSet;
-    use crate::levelset::testing::{ball, noise};
+    use crate::grid::{LEAF_VOXELS, leaf_offset, leaf_origin};
+    use crate::levelset::testing::{ball, block, noise};
 
     #[test]
     fn the_mesh_is_that_of_making_all_of_it() {
@@ -153,5 +167,48 @@ mod tests {
         let copy = LevelSet::new(moved.grid().deep_copy(), *moved.transform());
         check(&mut remesh, &moved, 0.0);
         assert_eq!(check(&mut remesh, &copy, 0.0), 0);
+    }
+    #[test]
+    fn a_leaf_far_away_may_change_the_numbers_that_a_leaf_uses() {
+        let run = RunOptions::default();
+        // A layer that few leaves share, and rods along each axis: most neighbours of a leaf have no surface.
+        let layer = |p: IVec3| (p.z as f32 - 12.3).clamp(-0.9, 0.9);
+        let rod = |axis: usize| {
+            move |p: IVec3| {
+                let [u, v] = [1, 2].map(|k| p[(axis + k) % 3] as f32 - 15.6);
+                ((u * u + v * v).sqrt() - 2.5).clamp(-0.9, 0.9)
+            }
+        };
+        let shapes = [block(5, layer), block(5, rod(0)), block(5, rod(1)), block(5, rod(2))];
+        for (n, mut level_set) in shapes.into_iter().enumerate() {
+            let mut remesh = Remesh::default();
+            remesh.level_set_to_mesh(&level_set, 0.0, &run).unwrap();
+            let mut state = 7 + n as u64;
+            let mut random = |below: u64| {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                (state >> 33) % below
+            };
+            let first = IVec3::new(24, 19, 13);
+            for step in 0..120 {
+                let ijk = if step == 0 { first } else { IVec3::from_array([0; 3].map(|_| 2 + random(36) as i32)) };
+                let id = level_set.grid().find(leaf_origin(ijk));
+                if id.is_sentinel() {
+                    continue;
+                }
+                let one: LeafSet = [id].into_iter().collect();
+                level_set.grid_mut().update(&one, |_, values, mask| {
+                    let at = leaf_offset(ijk);
+                    assert!(at < LEAF_VOXELS);
+                    if mask.get(at) {
+                        values.0[at] = -values.0[at];
+                    }
+                });
+                let mesh = level_set_to_mesh(&level_set, 0.0, &run).unwrap();
+                assert!(
+                    *remesh.level_set_to_mesh(&level_set, 0.0, &run).unwrap() == mesh,
+                    "shape {n}, step {step}, {ijk}"
+                );
+            }
+        }
     }
 }

@@ -249,9 +249,9 @@ impl Running<'_> {
                     let from = slot.source.as_ref().map(|source| (&source.0, source.1));
                     let written = match &mut self.results {
                         Some(results) if output.is_mesh() => results.with_mesh(path, |last| {
-                            let written = output.write_again(&slot.level_set, 0.0, from, last, self.run);
+                            let written = output.write_again(&slot.level_set, 0.0, from, Some(&mut *last), self.run);
                             // Quads are made as a whole.
-                            if last.bytes() > 0 {
+                            if !last.is_empty() {
                                 summary.details.insert("leaves_polygonised".into(), json!(last.made()));
                             }
                             written
