@@ -1,8 +1,8 @@
 //! Threads kept awake through work of many short parallel parts.
 //!
 //! A step of a region is some fifteen parallel parts of less than half a millisecond with a little serial work between them. Rayon's threads go to
-//! sleep after a few microseconds without work, and to wake one takes as long as a good part of such a part: a step of a region of 200,000
-//! voxels took 2.5 to 3.5 ms with two threads, 2.0 ms with both awake.
+//! sleep after a few microseconds without work, and to wake one takes as long as a good part of such a part: see
+//! `docs/PERFORMANCE.md`.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 /// How long a thread looks for work before it may sleep. Beside a longer serial part, waking it takes next to nothing.
 const PATIENCE: Duration = Duration::from_micros(200);
 
-/// Most threads that are kept awake: to call many takes longer than they could save.
+/// Most threads that are kept awake. Each is called by itself, and what that costs with many was not measured.
 const MOST_THREADS: usize = 8;
 
 /// Whether some work keeps the threads awake already.

@@ -160,6 +160,7 @@ impl MeshOptions {
             };
             return self.write_triangles(path, mesh, level_set.voxel_size(), run);
         }
+        // Its triangles are of no use to quads.
         if let Some(last) = last {
             *last = Remesh::default();
         }

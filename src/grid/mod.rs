@@ -220,7 +220,7 @@ impl Grid {
             })
         };
         let mut origins: Vec<IVec3> = set.par_pages().flat_map_iter(|leaves| leaves.iter().flat_map(beside)).collect();
-        origins.par_sort_unstable_by_key(|o| topology::key(*o));
+        origins.sort_unstable_by_key(|o| topology::key(*o));
         origins.dedup();
         origins
     }

@@ -61,15 +61,13 @@ pub(super) struct Topology {
     neighbours: Vec<OnceLock<Arc<NeighbourPage>>>,
 }
 
-/// Sort key of origins: x, then y, then z. One number, as comparing three in turn is mostly waiting for branches guessed wrong.
-pub(super) fn key(origin: IVec3) -> u128 {
-    // The order of the signed numbers as that of unsigned ones.
-    let [x, y, z] = origin.to_array().map(|v| u128::from(v.cast_unsigned() ^ 1 << 31));
-    x << 64 | y << 32 | z
+/// Sort key of origins: x, then y, then z.
+pub(super) fn key(origin: IVec3) -> (i32, i32, i32) {
+    (origin.x, origin.y, origin.z)
 }
 
 /// Sort key of slots: node by node, along a Z-order curve in each.
-fn block_key(origin: IVec3) -> (u128, u32) {
+fn block_key(origin: IVec3) -> ((i32, i32, i32), u32) {
     // Bits 0 to 3 to places 0, 3, 6, 9.
     let spread = |v: i32| {
         let v = (v & (NODE_LEAVES - 1)) as u32;
