@@ -50,6 +50,8 @@ mod bridge {
             });
             found.configure(&mut bridge).opt_level(3).files([
                 "cpp/archive.cc",
+                "cpp/fingerprint.cc",
+                "cpp/output.cc",
                 "cpp/grid.cc",
                 "cpp/chunks.cc",
                 "cpp/vector.cc",

@@ -120,6 +120,8 @@ public:
     void add_leaves(rust::Slice<const std::int32_t> origins);
     /// Fills leaves from `first` on, in the order they were added. Disjoint ranges may be filled in parallel.
     void fill(std::size_t first, rust::Slice<const float> values, rust::Slice<const std::uint64_t> masks) const;
+    /// Gives the next leaf its mask, and to an output its values, which stay where they are. For all leaves or none; nothing else sees them.
+    void lend(rust::Slice<const float> values, rust::Slice<const std::uint64_t> mask);
     /// Sets tiles, none of which may cover a leaf.
     void add_tiles(rust::Slice<const Tile> tiles);
 

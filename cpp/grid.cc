@@ -155,6 +155,17 @@ std::unique_ptr<Leaves> float_grid_leaves(const FloatGrid& grid) { return leaves
 
 // --- building ---
 
+namespace {
+
+void set_mask(LeafNode& leaf, const std::uint64_t* words)
+{
+    LeafNode::NodeMaskType mask;
+    for (std::size_t w = 0; w < kMaskWords; ++w) mask.getWord<std::uint64_t>(openvdb::Index(w)) = words[w];
+    leaf.setValueMask(mask);
+}
+
+} // namespace
+
 FloatGrid::FloatGrid(std::unique_ptr<Impl> i) : impl(std::move(i)) {}
 FloatGrid::~FloatGrid() = default;
 
@@ -189,6 +200,7 @@ void FloatGrid::add_leaves(rust::Slice<const std::int32_t> origins)
         require(accessor.probeConstLeaf(origin) == nullptr, "add_leaves: two leaves at one place");
         // Without its buffer: that is allocated where it is filled, in parallel.
         auto leaf = std::make_unique<LeafNode>(openvdb::PartialCreate(), origin, background, false);
+        leaf->setTransientData(static_cast<openvdb::Index32>(impl->leaves.size()));
         accessor.addLeaf(leaf.get());
         impl->leaves.push_back(leaf.release());
     }
@@ -204,12 +216,16 @@ void FloatGrid::fill(std::size_t first, rust::Slice<const float> values, rust::S
         LeafNode& leaf = *leaves[first + i];
         leaf.allocate();
         std::memcpy(leaf.buffer().data(), values.data() + i * kLeafVoxels, kLeafVoxels * sizeof(float));
-        LeafNode::NodeMaskType mask;
-        for (std::size_t w = 0; w < kMaskWords; ++w) {
-            mask.getWord<std::uint64_t>(openvdb::Index(w)) = masks[i * kMaskWords + w];
-        }
-        leaf.setValueMask(mask);
+        set_mask(leaf, masks.data() + i * kMaskWords);
     }
+}
+
+void FloatGrid::lend(rust::Slice<const float> values, rust::Slice<const std::uint64_t> mask)
+{
+    require(values.size() == kLeafVoxels && mask.size() == kMaskWords, "lend: wrong length");
+    require(impl->lent.size() < impl->leaves.size(), "lend: there is no such leaf");
+    set_mask(*impl->leaves[impl->lent.size()], mask.data());
+    impl->lent.push_back(values.data());
 }
 
 void FloatGrid::add_tiles(rust::Slice<const Tile> tiles)

@@ -8,6 +8,7 @@
 
 #include <iostream>
 #include <mutex>
+#include <optional>
 #include <stdexcept>
 #include <vector>
 
@@ -47,9 +48,37 @@ void write_origins(const std::vector<const NodeT*>& nodes, rust::Slice<std::int3
     }
 }
 
+struct Archive::Impl {
+    struct Entry {
+        openvdb::GridBase::Ptr grid;
+        std::string unique_name;
+        std::string instance_of;
+        bool half = false;
+        std::uint32_t compression = 0;
+        std::optional<double> background;
+        /// Where only that was wanted of the voxels.
+        std::string fingerprint;
+    };
+
+    std::uint32_t file_version = 0;
+    openvdb::VersionId library;
+    std::string uuid;
+    bool has_offsets = false;
+    openvdb::MetaMap metadata;
+    std::vector<Entry> entries;
+};
+/// The values of a grid's leaves if they are not in the leaves themselves: in the order in which these were added, which their transient data tell.
+using Lent = std::vector<const float*>;
+
+inline const float* values_of(const LeafNode& leaf, const Lent& lent)
+{
+    return lent.empty() ? leaf.buffer().data() : lent.at(leaf.transientData());
+}
+
 struct FloatGrid::Impl {
     openvdb::FloatGrid::Ptr grid;
     std::vector<LeafNode*> leaves; // in the order they were added; owned by the tree
+    Lent lent;
 };
 
 inline std::unique_ptr<FloatGrid> wrap(openvdb::FloatGrid::Ptr grid)
@@ -65,6 +94,16 @@ openvdb::FloatGrid::Ptr make_float_grid(double background);
 
 /// A grid of vectors whose components are these grids of one set of leaves, with the name, metadata and transform of the first.
 openvdb::GridBase::Ptr vectors_of(const FloatGrid& x, const FloatGrid& y, const FloatGrid& z);
+
+/// Writes a leaf as the stream's compression says.
+void write_leaf(std::ostream& stream, const LeafNode& leaf, const float* values, bool half);
+
+/// 128 bits, as hexadecimal digits, of a grid of any type; grids stored as half compare as rounded. Of a grid of floats hashes of its leaves stand
+/// for the values.
+std::string fingerprint(const openvdb::GridBase& grid, const Lent& lent = {});
+
+/// Reads the voxels of a grid whose structure was read, and keeps nothing of them but the fingerprint.
+std::string read_fingerprint(openvdb::FloatGrid& grid, std::istream& stream);
 
 /// The linear transform of a row-major 4x4 matrix that acts on columns.
 openvdb::math::Transform::Ptr linear_transform(rust::Slice<const double> matrix);

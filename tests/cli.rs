@@ -201,6 +201,7 @@ fn operators_say_what_they_need() {
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--iteratons", "3"], "--iterations"),
         (vec!["smooth", "a.vdb"], "--output"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--iterations", "1.5"], "whole number"),
+        (vec!["smooth", "a.vdb", "-o", "b.vdb", "--iterations=-3"], "a whole number from 0 to 4294967295"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--time", "-1"], "time"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--method", "magic"], "laplacian"),
         (vec!["smooth", "a.vdb", "-o", "b.vdb", "--method", "mean", "--width", "9"], "1 to 8"),

@@ -99,7 +99,12 @@ fn bad_recipes_are_refused_with_line_and_remedy() {
         ("[[step]]\nop = \"smoth\"\ninput = \"a.obj\"\nname = \"s\"".into(), 2, &["r.toml:3", "did you mean `smooth`"]),
         // wrong types and values
         (smooth("iterations = \"three\""), 2, &["r.toml:11: smooth `s`", "iterations = \"three\""]),
-        (smooth("iterations = 2.5"), 2, &["r.toml:11:", "iterations = 2.5"]),
+        (smooth("iterations = 2.5"), 2, &["r.toml:11:", "iterations = 2.5", "a whole number from 0"]),
+        (smooth("iterations = -3"), 2, &["r.toml:11:", "iterations = -3", "a whole number from 0"]),
+        (smooth("time = true"), 2, &["r.toml:11:", "time = true", "a number"]),
+        (smooth("preserve_shape = 3"), 2, &["r.toml:11:", "true or false"]),
+        (smooth("method = 3"), 2, &["r.toml:11:", "method = 3", "curvature, laplacian"]),
+        (smooth("method = \"guassian\""), 2, &["r.toml:11:", "did you mean `gaussian`"]),
         (smooth("method = \"magic\""), 2, &["r.toml:11:", "magic", "laplacian"]),
         (smooth("iterations = 3\ntime = -1.0"), 2, &["r.toml:12:", "either `iterations` or `time`"]),
         (smooth("iterations = 1979-05-27"), 2, &["r.toml:11", "no dates"]),

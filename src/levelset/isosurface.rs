@@ -102,6 +102,8 @@ pub(crate) struct SurfaceLeaf {
     pub first_vertex: u32,
     /// Number of its vertices.
     pub vertices: u32,
+    /// Number of its first triangle.
+    pub first_triangle: usize,
     /// Number of its triangles.
     pub triangles: u32,
     /// Number of pieces of surface, one or more a crossed cell.
@@ -128,7 +130,16 @@ impl SurfaceLeaf {
             loops += case.loops;
         });
         let vertices = u32::from(vertices);
-        (vertices + loops > 0).then_some(Self { id, first_vertex: 0, vertices, triangles, loops, edges, ranks })
+        (vertices + loops > 0).then_some(Self {
+            id,
+            first_vertex: 0,
+            vertices,
+            first_triangle: 0,
+            triangles,
+            loops,
+            edges,
+            ranks,
+        })
     }
 
     /// Calls `f` with axis and offset of the first voxel of each crossed edge, in the order of the vertices' numbers.
@@ -181,10 +192,11 @@ impl<'a> IsoSurface<'a> {
             .flatten()
             .collect();
         let mut places = vec![NO_SURFACE; grid.slot_count()];
-        let mut vertices = 0u32;
+        let (mut vertices, mut triangles) = (0u32, 0);
         for (place, leaf) in leaves.iter_mut().enumerate() {
             places[leaf.id.index()] = place as u32;
-            leaf.first_vertex = vertices;
+            (leaf.first_vertex, leaf.first_triangle) = (vertices, triangles);
+            triangles += leaf.triangles as usize;
             vertices = vertices.checked_add(leaf.vertices).ok_or_else(|| {
                 EditError::parameter(
                     operation,
@@ -216,6 +228,11 @@ impl<'a> IsoSurface<'a> {
     /// Number of vertices.
     pub fn vertex_count(&self) -> usize {
         self.leaves.last().map_or(0, |leaf| (leaf.first_vertex + leaf.vertices) as usize)
+    }
+
+    /// Number of triangles.
+    pub fn triangle_count(&self) -> usize {
+        self.leaves.last().map_or(0, |leaf| leaf.first_triangle + leaf.triangles as usize)
     }
 
     /// The inside voxels of a leaf or sentinel.

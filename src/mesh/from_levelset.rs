@@ -42,12 +42,11 @@ pub(super) struct Polygons {
 pub(super) fn polygonise(level_set: &LevelSet, iso: f32, last: Option<&Last>, run: &RunOptions) -> Result<Polygons> {
     let surface = surface_of(level_set, iso, OPERATION, run)?;
     let leaves = surface.leaves();
-    let triangle_count: usize = leaves.iter().map(|leaf| leaf.triangles as usize).sum();
-    let bytes = surface.vertex_count() * size_of::<DVec3>() + triangle_count * size_of::<[u32; 3]>();
+    let bytes = surface.vertex_count() * size_of::<DVec3>() + surface.triangle_count() * size_of::<[u32; 3]>();
     run.reserve(OPERATION, bytes as u64, MEMORY_ADVICE)?;
 
     let mut positions = vec![DVec3::ZERO; surface.vertex_count()];
-    let mut triangles = vec![[0; 3]; triangle_count];
+    let mut triangles = vec![[0; 3]; surface.triangle_count()];
     let transform = level_set.transform();
     // A mirrored transform turns the orientation round.
     let mirrored = transform.to_world().matrix3.determinant() < 0.0;

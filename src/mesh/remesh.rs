@@ -38,13 +38,7 @@ impl Remesh {
         };
         let Polygons { mesh, leaves, places, made } = made?;
         self.made = made;
-        let mut triangles = 0;
-        let first_triangle = |leaf: &SurfaceLeaf| {
-            triangles += leaf.triangles as usize;
-            triangles - leaf.triangles as usize
-        };
-        let first_triangles = leaves.iter().map(first_triangle).collect();
-        let last = Last { level_set: level_set.clone(), iso, mesh, leaves, places, first_triangles };
+        let last = Last { level_set: level_set.clone(), iso, mesh, leaves, places };
         Ok(&self.last.insert(last).mesh)
     }
 
@@ -62,8 +56,8 @@ impl Remesh {
     pub fn bytes(&self) -> u64 {
         self.last.as_ref().map_or(0, |last| {
             let mesh = size_of_val(&last.mesh.positions[..]) + size_of_val(&last.mesh.triangles[..]);
-            let leaves = size_of_val(&last.leaves[..]) + size_of_val(&last.first_triangles[..]);
-            last.level_set.grid().bytes() + (mesh + leaves + size_of_val(&last.places[..])) as u64
+            let leaves = size_of_val(&last.leaves[..]) + size_of_val(&last.places[..]);
+            last.level_set.grid().bytes() + (mesh + leaves) as u64
         })
     }
 }
@@ -77,8 +71,6 @@ pub(super) struct Last {
     leaves: Vec<SurfaceLeaf>,
     /// The place of each among them, by slot.
     places: Vec<u32>,
-    /// The first triangle of each.
-    first_triangles: Vec<usize>,
 }
 
 /// What a leaf had in the last mesh.
@@ -109,11 +101,10 @@ impl Last {
         if !(0..8).all(|c| is_same(corner(c))) {
             return None;
         }
-        let place = *self.places.get(old.id.index())? as usize;
-        let (vertex, triangle) = (old.first_vertex as usize, *self.first_triangles.get(place)?);
+        let vertex = old.first_vertex as usize;
         Some(Kept {
             positions: self.mesh.positions.get(vertex..vertex + leaf.vertices as usize)?,
-            triangles: self.mesh.triangles.get(triangle..triangle + leaf.triangles as usize)?,
+            triangles: self.mesh.triangles.get(old.first_triangle..old.first_triangle + leaf.triangles as usize)?,
             shift,
         })
     }
@@ -167,6 +158,7 @@ mod tests {
         check(&mut remesh, &moved, 0.0);
         assert_eq!(check(&mut remesh, &copy, 0.0), 0);
     }
+
     #[test]
     fn a_leaf_far_away_may_change_the_numbers_that_a_leaf_uses() {
         let run = RunOptions::default();

@@ -313,10 +313,34 @@ pub(crate) fn parse<P: DeserializeOwned + JsonSchema>(operation: &str, values: M
         for (name, value) in values {
             let alone = Map::from_iter([(name.clone(), value.clone())]);
             if let Err(error) = serde_json::from_value::<P>(Value::Object(alone)) {
-                let kind = known.and_then(|k| k.get(&name)).map(kind_of).unwrap_or_default();
-                return EditError::parameter(operation, &name, value, format!("{error}; expected {kind}"));
+                let property = known.and_then(|k| k.get(&name)).unwrap_or(&Value::Null);
+                let accepted = accepted(property, &value, &error.to_string());
+                return EditError::parameter(operation, &name, value, accepted);
             }
         }
         EditError::parameter(operation, "parameters", "", error.to_string())
     })
+}
+
+/// What a parameter takes, in words for a user who gave it a `value` that was refused with `error`.
+fn accepted(property: &Value, value: &Value, error: &str) -> String {
+    let kind = kind_of(property);
+    // Errors of serde's own speak of types.
+    let is_serdes = |kinds: &[&str]| kinds.iter().any(|kind| error.starts_with(kind));
+    if is_serdes(&["unknown variant"]) {
+        return suggest(value.as_str().unwrap_or_default(), kind.split('|'));
+    }
+    if !is_serdes(&["invalid type", "invalid value", "data did not match"]) {
+        return format!("{error}; expected {kind}");
+    }
+    let bound = |name| property.get(name).and_then(Value::as_i64);
+    let largest = (property.get("format").and_then(Value::as_str) == Some("uint32")).then_some(u32::MAX.into());
+    match (kind.as_str(), bound("minimum"), bound("maximum").or(largest)) {
+        ("integer", Some(least), Some(most)) => format!("a whole number from {least} to {most}"),
+        ("integer", Some(least), None) => format!("a whole number, {least} or more"),
+        ("integer", ..) => "a whole number".to_owned(),
+        ("number", ..) => "a number".to_owned(),
+        ("boolean", ..) => "true or false".to_owned(),
+        _ => kind.replace('|', ", "),
+    }
 }

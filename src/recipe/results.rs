@@ -37,17 +37,15 @@ pub(super) struct Key {
 /// Stands for a key; the same for the same one.
 pub(super) type Identity = u64;
 
-/// The results of the steps of a recipe, its pictures and meshes. Each run forgets what it did not use.
+/// The results of the steps of a recipe, and what its files were written from. Each run forgets what it did not use.
 #[derive(Default)]
 pub struct Results {
     /// What stands for each key, and whether it was asked for.
     identities: HashMap<Key, (Identity, bool)>,
     made: u64,
     steps: HashMap<Identity, Made>,
-    /// The last pictures of each file, one an input, and whether they were asked for.
-    pictures: HashMap<PathBuf, (Vec<Redraw>, bool)>,
-    /// The last mesh of each file, and whether it was asked for.
-    meshes: HashMap<PathBuf, (Remesh, bool)>,
+    /// What each file was written from last.
+    outputs: HashMap<PathBuf, LastOutput>,
     /// Most bytes of results that are kept; all if not given.
     most: Option<u64>,
 }
@@ -60,6 +58,22 @@ pub(super) struct Made {
     pub files: Vec<(PathBuf, Stamp)>,
     bytes: u64,
     is_used: bool,
+}
+
+/// What a file was written from: its next content takes from this what has not changed.
+#[derive(Default)]
+pub(super) struct LastOutput {
+    /// Of a picture, one an input.
+    pub pictures: Vec<Redraw>,
+    /// Of a mesh.
+    pub mesh: Remesh,
+    is_used: bool,
+}
+
+impl LastOutput {
+    fn bytes(&self) -> u64 {
+        self.pictures.iter().map(Redraw::bytes).sum::<u64>() + self.mesh.bytes()
+    }
 }
 
 impl Results {
@@ -96,46 +110,32 @@ impl Results {
 
     fn has_room(&self, bytes: u64) -> bool {
         let steps = self.steps.values().map(|made| made.bytes);
-        let pictures = self.pictures.values().flat_map(|(pictures, _)| pictures).map(Redraw::bytes);
-        let meshes = self.meshes.values().map(|(mesh, _)| mesh.bytes());
-        self.most.is_none_or(|most| steps.chain(pictures).chain(meshes).fold(bytes, u64::saturating_add) <= most)
+        let outputs = self.outputs.values().map(LastOutput::bytes);
+        self.most.is_none_or(|most| steps.chain(outputs).fold(bytes, u64::saturating_add) <= most)
     }
 
-    /// Has something done with the last pictures of a file.
-    pub(super) fn with_pictures<T>(&mut self, path: &Path, draw: impl FnOnce(&mut Vec<Redraw>) -> T) -> T {
-        let (mut pictures, _) = self.pictures.remove(path).unwrap_or_default();
-        let drawn = draw(&mut pictures);
-        if self.has_room(pictures.iter().map(Redraw::bytes).sum()) {
-            self.pictures.insert(path.into(), (pictures, true));
-        }
-        drawn
-    }
-
-    /// Has something done with the last mesh of a file.
-    pub(super) fn with_mesh<T>(&mut self, path: &Path, write: impl FnOnce(&mut Remesh) -> T) -> T {
-        let (mut mesh, _) = self.meshes.remove(path).unwrap_or_default();
-        let written = write(&mut mesh);
-        if self.has_room(mesh.bytes()) {
-            self.meshes.insert(path.into(), (mesh, true));
+    /// Has a file written from what it was written from last.
+    pub(super) fn with_last<T>(&mut self, path: &Path, write: impl FnOnce(&mut LastOutput) -> T) -> T {
+        let mut last = self.outputs.remove(path).unwrap_or_default();
+        let written = write(&mut last);
+        last.is_used = true;
+        if self.has_room(last.bytes()) {
+            self.outputs.insert(path.into(), last);
         }
         written
     }
 
-    /// Notes that the last pictures or the last mesh of a file are still those that are wanted.
+    /// Notes that the last content of a file is still the one that is wanted.
     pub(super) fn keep_last(&mut self, path: &Path) {
-        if let Some(pictures) = self.pictures.get_mut(path) {
-            pictures.1 = true;
-        }
-        if let Some(mesh) = self.meshes.get_mut(path) {
-            mesh.1 = true;
+        if let Some(last) = self.outputs.get_mut(path) {
+            last.is_used = true;
         }
     }
 
     /// Forgets what was not used since this was called last. To be called when a recipe has run for all frames.
     pub fn forget_unused(&mut self) {
         self.steps.retain(|_, made| std::mem::take(&mut made.is_used));
-        self.pictures.retain(|_, (_, is_used)| std::mem::take(is_used));
-        self.meshes.retain(|_, (_, is_used)| std::mem::take(is_used));
+        self.outputs.retain(|_, last| std::mem::take(&mut last.is_used));
         self.identities.retain(|_, (_, is_used)| std::mem::take(is_used));
     }
 }

@@ -8,7 +8,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::plan::{Action, Given, Plan, Planned};
-use super::results::{Identity, Key, Results, Stamp};
+use super::results::{Identity, Key, LastOutput, Results, Stamp};
 use super::step::Conversion;
 use crate::atomic::{Staging, write_atomically};
 use crate::error::{EditError, Result};
@@ -248,7 +248,8 @@ impl Running<'_> {
                     }
                     let from = slot.source.as_ref().map(|source| (&source.0, source.1));
                     let written = match &mut self.results {
-                        Some(results) if output.is_mesh() => results.with_mesh(path, |last| {
+                        Some(results) if output.is_mesh() => results.with_last(path, |last| {
+                            let last = &mut last.mesh;
                             let written = output.write_again(&slot.level_set, 0.0, from, Some(&mut *last), self.run);
                             // Quads are made as a whole.
                             if !last.is_empty() {
@@ -283,13 +284,14 @@ impl Running<'_> {
                         image
                     }
                     Some(results) => {
-                        let draw = |last: &mut Vec<Redraw>| {
+                        let draw = |last: &mut LastOutput| {
+                            let last = &mut last.pictures;
                             let coarse = &mut |image: &Image| write(path, image);
                             let image = picture.draw_again(&level_sets, last, coarse, self.run)?;
                             drawn = Some(last.iter().map(Redraw::drawn).sum::<usize>());
                             Ok::<_, EditError>(image)
                         };
-                        let image = results.with_pictures(path, draw)?;
+                        let image = results.with_last(path, draw)?;
                         write(path, &image)?;
                         image
                     }

@@ -66,7 +66,8 @@ impl Step {
     /// The keys that it could have.
     pub fn key_names(&self) -> Vec<String> {
         let options = self.parameters.iter().filter_map(Parameter::sequence).flat_map(|sequence| sequence.options);
-        self.parameters.iter().map(|p| p.name.clone()).chain(options.map(|option| option.name.to_owned())).collect()
+        let options = options.map(|option| option.name).filter(|name| self.parameters.iter().all(|p| p.name != *name));
+        self.parameters.iter().map(|p| p.name.clone()).chain(options.map(str::to_owned)).collect()
     }
 }
 

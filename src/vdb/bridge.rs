@@ -97,6 +97,9 @@ pub(super) mod ffi {
         /// # Safety
         /// No two calls at a time may cover the same leaf.
         unsafe fn fill(self: &FloatGrid, first: usize, values: &[f32], masks: &[u64]) -> Result<()>;
+        /// # Safety
+        /// The values stay where they are, unchanged, until an output that takes the grid is sealed or gone.
+        unsafe fn lend(self: Pin<&mut FloatGrid>, values: &[f32], mask: &[u64]) -> Result<()>;
         fn add_tiles(self: Pin<&mut FloatGrid>, tiles: &[Tile]) -> Result<()>;
         fn set_affine(self: Pin<&mut FloatGrid>, matrix: &[f64]) -> Result<()>;
         fn carry(self: Pin<&mut FloatGrid>, archive: &Archive, index: usize, with_transform: bool) -> Result<()>;

@@ -4,7 +4,7 @@
 //! level set of one of its grids; [`write()`] puts level sets back beside everything else the file held. [`mod@reference`] runs
 //! OpenVDB's own operators for comparison.
 //!
-//! The C++ side is in `cpp/` and small on purpose: `archive.cc` (files), `grid.cc` (leaves and tiles), `vector.cc` (components of vectors), `reference.cc`
+//! The C++ side is in `cpp/` and small on purpose: `archive.cc` and `output.cc` (files), `grid.cc` (leaves and tiles), `vector.cc` (components of vectors), `reference.cc`
 //! and `reference_morph.cc` (OpenVDB's tools). Every C++ exception becomes an error here; nothing that OpenVDB logs reaches standard output.
 //!
 //! A truncated or damaged file is an error wherever it shows: the bytes end early, a grid does not begin or end where the

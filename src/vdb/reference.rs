@@ -10,7 +10,7 @@ use glam::Vec3;
 
 use super::bridge::ffi;
 use super::read::read_grid;
-use super::write::{matrix, to_openvdb};
+use super::write::{Values, matrix, to_openvdb};
 use crate::error::{EditError, Result};
 use crate::grid::Transform;
 use crate::levelset::LevelSet;
@@ -131,7 +131,7 @@ fn failed(e: cxx::Exception) -> EditError {
 impl ReferenceGrid {
     /// A copy of a level set.
     pub fn from_level_set(level_set: &LevelSet) -> Result<Self> {
-        Ok(Self { grid: to_openvdb(level_set).map_err(failed)?, transform: *level_set.transform() })
+        Ok(Self { grid: to_openvdb(level_set, Values::Copied).map_err(failed)?, transform: *level_set.transform() })
     }
 
     /// A copy as a level set of ours: values, masks and signs.

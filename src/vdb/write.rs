@@ -2,6 +2,7 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::pin::Pin;
 
 use cxx::UniquePtr;
 use rayon::prelude::*;
@@ -131,14 +132,14 @@ fn write_all(
     }
     let (mut content, mut count) = collect(grids, input, options).map_err(|e| output.error(e.what()))?;
     for field in fields {
-        let made = to_openvdb_field(field, options).and_then(|grid| content.pin_mut().add_grid(grid));
+        let made = to_openvdb_field(field, Values::Lent, options).and_then(|grid| content.pin_mut().add_grid(grid));
         made.map_err(|e| output.error(e.what()))?;
         count += 1;
     }
     if let Some(VectorsToWrite { components: [x, y, z], name }) = vectors {
         // Halves are compared after rounding for grids of floats alone.
         let whole = WriteOptions { precision: None, ..options.clone() };
-        let component = |field| to_openvdb_field(&FieldToWrite { field, name }, &whole);
+        let component = |field| to_openvdb_field(&FieldToWrite { field, name }, Values::Copied, &whole);
         let mut add = || content.pin_mut().add_vectors(component(x)?, component(y)?, component(z)?);
         add().map_err(|e| output.error(e.what()))?;
         count += 1;
@@ -186,7 +187,7 @@ fn to_openvdb_grid(
     input: Option<&VdbFile>,
     options: &WriteOptions,
 ) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
-    let mut made = to_openvdb(grid.level_set)?;
+    let mut made = to_openvdb(grid.level_set, Values::Lent)?;
     let mut precision = options.precision;
     if let (Some(file), Some(index)) = (input, grid.replaces) {
         let listing = &file.listing().grids[index];
@@ -206,11 +207,12 @@ fn to_openvdb_grid(
 
 fn to_openvdb_field(
     to_write: &FieldToWrite<'_>,
+    values: Values,
     options: &WriteOptions,
 ) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
     let FieldToWrite { field, name } = to_write;
     let mut made = ffi::new_float_grid(0.0)?;
-    fill(made.pin_mut(), field.grid())?;
+    fill(made.pin_mut(), field.grid(), values)?;
     made.pin_mut().set_affine(&matrix(field.transform()))?;
     made.pin_mut().set_creator(CREATOR)?;
     made.pin_mut().set_name(name)?;
@@ -218,11 +220,20 @@ fn to_openvdb_field(
     Ok(made)
 }
 
-/// A copy of a level set in OpenVDB's own tree: all leaves, and the inside as tiles.
-pub(super) fn to_openvdb(level_set: &LevelSet) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
+/// Where the values of an OpenVDB grid are.
+#[derive(Clone, Copy)]
+pub(super) enum Values {
+    /// In its own leaves.
+    Copied,
+    /// Where ours are, which must outlive it and what it is written by: nothing but an output may use the grid.
+    Lent,
+}
+
+/// A level set in OpenVDB's own tree: all leaves, and the inside as tiles.
+pub(super) fn to_openvdb(level_set: &LevelSet, values: Values) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
     let grid = level_set.grid();
     let mut made = ffi::new_level_set(f64::from(grid.background()))?;
-    fill(made.pin_mut(), grid)?;
+    fill(made.pin_mut(), grid, values)?;
     let value = -grid.background();
     let tiles: Vec<ffi::Tile> = grid
         .inside_tiles()
@@ -241,15 +252,23 @@ pub(super) fn matrix(transform: &Transform) -> [f64; 16] {
     [x.x, y.x, z.x, t.x, x.y, y.y, z.y, t.y, x.z, y.z, z.z, t.z, 0.0, 0.0, 0.0, 1.0]
 }
 
-fn fill(mut made: std::pin::Pin<&mut ffi::FloatGrid>, grid: &Grid) -> Result<(), cxx::Exception> {
+fn fill(mut made: Pin<&mut ffi::FloatGrid>, grid: &Grid, values: Values) -> Result<(), cxx::Exception> {
     let ids = grid.leaves();
     let origins: Vec<i32> = ids.iter().flat_map(|&id| grid.origin(id).to_array()).collect();
     made.as_mut().add_leaves(&origins)?;
-    let made_ref = made.as_ref().get_ref();
-    ids.par_iter().with_min_len(16).enumerate().try_for_each(|(index, &id)| {
-        // SAFETY: every task fills another leaf.
-        unsafe { made_ref.fill(index, &grid.values(id).0, &grid.mask(id).0) }
-    })
+    match values {
+        Values::Copied => {
+            let made = made.as_ref().get_ref();
+            ids.par_iter().with_min_len(16).enumerate().try_for_each(|(index, &id)| {
+                // SAFETY: every task fills another leaf.
+                unsafe { made.fill(index, &grid.values(id).0, &grid.mask(id).0) }
+            })
+        }
+        Values::Lent => ids.iter().try_for_each(|&id| {
+            // SAFETY: `write_all` borrows the grid for longer than what it writes lives.
+            unsafe { made.as_mut().lend(&grid.values(id).0, &grid.mask(id).0) }
+        }),
+    }
 }
 
 /// Where a file goes.
@@ -267,7 +286,7 @@ impl Target<'_> {
     }
 
     /// Writes and verifies; returns the size.
-    fn write(&self, content: std::pin::Pin<&mut ffi::Output>, compression: u32) -> Result<u64> {
+    fn write(&self, content: Pin<&mut ffi::Output>, compression: u32) -> Result<u64> {
         if self.path == Path::new(PIPE) {
             return self.write_through(content, compression, std::io::stdout().lock());
         }
@@ -290,7 +309,7 @@ impl Target<'_> {
     /// To a pipe or device: verified in memory first.
     fn write_through(
         &self,
-        mut content: std::pin::Pin<&mut ffi::Output>,
+        mut content: Pin<&mut ffi::Output>,
         compression: u32,
         mut to: impl Write,
     ) -> Result<u64> {
@@ -303,7 +322,7 @@ impl Target<'_> {
 
     fn replace(
         &self,
-        mut content: std::pin::Pin<&mut ffi::Output>,
+        mut content: Pin<&mut ffi::Output>,
         compression: u32,
         real: &Path,
         old: Option<std::fs::Metadata>,
