@@ -17,6 +17,7 @@
 
 #include <tbb/global_control.h>
 
+#include <algorithm>
 #include <stdexcept>
 
 namespace vdb_edit {
@@ -178,6 +179,7 @@ public:
             }
             if (wanted == Wanted::voxels) {
                 for (const auto& descriptor : descriptors) connectInstance(descriptor, by_name);
+                share_opaque(out->entries);
             }
             if (position() != size_) {
                 throw std::runtime_error(std::to_string(size_ - position()) + " bytes follow the last grid");
@@ -223,6 +225,18 @@ private:
             grid->readTransform(is_);
             if (!descriptor.isInstance()) read_background(*grid, entry);
             is_.seekg(end);
+        } else if (is_opaque(*grid, descriptor)) {
+            entry.opaque = read_opaque(descriptor);
+            is_.seekg(descriptor.getGridPos());
+            readGridCompression(is_);
+            grid->readMeta(is_);
+            grid->readTransform(is_);
+            if (position() > descriptor.getBlockPos()) throw std::runtime_error("its values begin before it is described");
+            is_.seekg(end);
+            if (wanted == Wanted::fingerprints) {
+                entry.fingerprint = fingerprint(*entry.opaque.bytes);
+                entry.opaque = {};
+            }
         } else if (wanted == Wanted::fingerprints && is_floats(*grid, descriptor)) {
             readGridCompression(is_);
             grid->readMeta(is_);
@@ -241,6 +255,33 @@ private:
             if (wanted != Wanted::voxels) grid->newTree();
         }
         return entry;
+    }
+
+    /// Whether points come next that can be carried over as they are: OpenVDB ends the process where an assertion about their chunks fails.
+    bool is_opaque(const openvdb::GridBase& grid, const vio::GridDescriptor& descriptor) const
+    {
+        const std::string type = grid.valueType();
+        return (type == "ptdataidx32" || type == "ptidx32") && !descriptor.isInstance() && inputHasGridOffsets() &&
+            fileVersion() == openvdb::OPENVDB_FILE_VERSION;
+    }
+
+    /// Gives grids that share the tree of another what that one is carried over by.
+    static void share_opaque(std::vector<vdb_edit::Archive::Impl::Entry>& entries)
+    {
+        for (auto& entry : entries) {
+            const auto is_parent = [&](const auto& other) { return other.unique_name == entry.instance_of; };
+            const auto parent = std::find_if(entries.begin(), entries.end(), is_parent);
+            if (!entry.instance_of.empty() && parent != entries.end()) entry.opaque = parent->opaque;
+        }
+    }
+
+    Opaque read_opaque(const vio::GridDescriptor& descriptor)
+    {
+        const std::int64_t begin = descriptor.getGridPos(), values = descriptor.getBlockPos(), end = descriptor.getEndPos();
+        if (values < begin || values > end) throw std::runtime_error("its values begin outside of it");
+        auto bytes = std::make_shared<std::string>(static_cast<std::size_t>(end - begin), '\0');
+        is_.read(bytes->data(), end - begin);
+        return {std::move(bytes), values - begin};
     }
 
     /// Whether a grid of floats comes next, with a tree of its own.
@@ -396,7 +437,8 @@ std::unique_ptr<Leaves> archive_component(const Archive& archive, std::size_t in
 rust::String grid_fingerprint(const Archive& archive, std::size_t index)
 {
     const QuietOutput scope;
-    return fingerprint(*archive.impl->entries.at(index).grid);
+    const auto& entry = archive.impl->entries.at(index);
+    return entry.opaque.bytes ? fingerprint(*entry.opaque.bytes) : fingerprint(*entry.grid);
 }
 
 } // namespace vdb_edit

@@ -67,6 +67,13 @@ std::string fingerprint(const openvdb::GridBase& grid, const Lent& lent)
     return hash_floats(*floats, hashes);
 }
 
+std::string fingerprint(const std::string& bytes)
+{
+    HashBuffer hash;
+    hash.sputn(bytes.data(), static_cast<std::streamsize>(bytes.size()));
+    return hash.digest();
+}
+
 std::string read_fingerprint(openvdb::FloatGrid& grid, std::istream& is)
 {
     std::vector<LeafNode*> leaves;

@@ -7,9 +7,11 @@
 #include <openvdb/openvdb.h>
 
 #include <iostream>
+#include <memory>
 #include <mutex>
 #include <optional>
 #include <stdexcept>
+#include <string>
 #include <vector>
 
 namespace vdb_edit {
@@ -48,6 +50,14 @@ void write_origins(const std::vector<const NodeT*>& nodes, rust::Slice<std::int3
     }
 }
 
+/// What a file holds of a grid that is carried over without being decoded, from the compression to the end.
+struct Opaque {
+    /// Null if the grid was decoded.
+    std::shared_ptr<const std::string> bytes;
+    /// Where in it the values begin.
+    std::int64_t values = 0;
+};
+
 struct Archive::Impl {
     struct Entry {
         openvdb::GridBase::Ptr grid;
@@ -58,6 +68,7 @@ struct Archive::Impl {
         std::optional<double> background;
         /// Where only that was wanted of the voxels.
         std::string fingerprint;
+        Opaque opaque;
     };
 
     std::uint32_t file_version = 0;
@@ -101,6 +112,9 @@ void write_leaf(std::ostream& stream, const LeafNode& leaf, const float* values,
 /// 128 bits, as hexadecimal digits, of a grid of any type; grids stored as half compare as rounded. Of a grid of floats hashes of its leaves stand
 /// for the values.
 std::string fingerprint(const openvdb::GridBase& grid, const Lent& lent = {});
+
+/// 128 bits of bytes, as hexadecimal digits.
+std::string fingerprint(const std::string& bytes);
 
 /// Reads the voxels of a grid whose structure was read, and keeps nothing of them but the fingerprint.
 std::string read_fingerprint(openvdb::FloatGrid& grid, std::istream& stream);

@@ -27,6 +27,7 @@ struct Output::Impl {
     struct Outgoing {
         openvdb::GridBase::ConstPtr grid;
         Lent lent;
+        Opaque opaque;
     };
 
     struct Sealed {
@@ -227,7 +228,6 @@ public:
         setCompression(compression);
         vio::StreamMetadata::Ptr tag(new vio::StreamMetadata);
         vio::setStreamMetadataPtr(stream, tag, /*transfer=*/false);
-        vio::setDataCompression(stream, compression);
         vio::setWriteGridStatsMetadata(stream, isGridStatsMetadataEnabled());
         writeHeader(stream, /*seekable=*/true);
         content.metadata.writeMeta(stream);
@@ -249,6 +249,8 @@ private:
         std::map<const openvdb::TreeBase*, vio::GridDescriptor> written;
         for (const Outgoing& outgoing : grids) {
             const auto& grid = outgoing.grid;
+            // The last grid may be of a class that is not compressed as the file is.
+            vio::setDataCompression(stream, compression());
             // Grids without a name, and those of one name, are numbered.
             const std::string plain = grid->getName();
             std::string name = plain.empty() || uses[plain] > 1 ? vio::GridDescriptor::addSuffix(plain, 0) : plain;
@@ -258,27 +260,53 @@ private:
             if (same_tree != written.end() && same_tree->second.saveFloatAsHalf() == descriptor.saveFloatAsHalf()) {
                 descriptor.setInstanceParentName(same_tree->second.uniqueName());
                 writeGridInstance(descriptor, grid, stream, /*seekable=*/true);
+                continue;
+            }
+            written[&grid->baseTree()] = descriptor;
+            if (outgoing.opaque.bytes) {
+                write_opaque(stream, descriptor, outgoing.opaque);
             } else if (const auto* floats = dynamic_cast<const openvdb::FloatGrid*>(grid.get())) {
                 write_floats(stream, descriptor, *floats, outgoing.lent);
-                written[&grid->baseTree()] = descriptor;
             } else {
                 writeGrid(descriptor, grid, stream, /*seekable=*/true);
-                written[&grid->baseTree()] = descriptor;
             }
-            // Not every class of grids is compressed as the file is.
-            vio::setDataCompression(stream, compression());
         }
     }
 
-    /// As `writeGrid`.
-    void write_floats(
-        std::ostream& stream, vio::GridDescriptor& descriptor, const openvdb::FloatGrid& grid, const Lent& lent)
+    /// Writes a grid between its description and its offsets, which are known when it is written. `write_content` sets where its values begin.
+    template<typename WriteContent>
+    void with_offsets(std::ostream& stream, vio::GridDescriptor& descriptor, WriteContent write_content)
     {
         descriptor.writeHeader(stream);
         const std::streampos offsets = stream.tellp();
-        // To be written again when they are known.
         descriptor.writeStreamPos(stream);
         descriptor.setGridPos(stream.tellp());
+        write_content();
+        descriptor.setEndPos(stream.tellp());
+        stream.seekp(offsets);
+        descriptor.writeStreamPos(stream);
+        descriptor.seekToEnd(stream);
+    }
+
+    void write_opaque(std::ostream& stream, vio::GridDescriptor& descriptor, const Opaque& opaque)
+    {
+        with_offsets(stream, descriptor, [&] {
+            descriptor.setBlockPos(descriptor.getGridPos() + opaque.values);
+            stream.write(opaque.bytes->data(), static_cast<std::streamsize>(opaque.bytes->size()));
+        });
+    }
+
+    /// As OpenVDB's `writeGrid`.
+    void write_floats(
+        std::ostream& stream, vio::GridDescriptor& descriptor, const openvdb::FloatGrid& grid, const Lent& lent)
+    {
+        with_offsets(stream, descriptor, [&] { write_content(stream, descriptor, grid, lent); });
+        vio::setGridBackgroundValuePtr(stream, nullptr);
+    }
+
+    void write_content(
+        std::ostream& stream, vio::GridDescriptor& descriptor, const openvdb::FloatGrid& grid, const Lent& lent)
+    {
         setGridCompression(stream, grid);
         const StoredLeaves leaves = store_leaves(grid, lent, vio::getDataCompression(stream), compression());
 
@@ -300,11 +328,6 @@ private:
         for (const std::string& block : leaves.blocks) {
             stream.write(block.data(), static_cast<std::streamsize>(block.size()));
         }
-        descriptor.setEndPos(stream.tellp());
-        stream.seekp(offsets);
-        descriptor.writeStreamPos(stream);
-        descriptor.seekToEnd(stream);
-        vio::setGridBackgroundValuePtr(stream, nullptr);
     }
 };
 
@@ -323,17 +346,18 @@ void Output::carry_metadata(const Archive& archive) { impl->metadata = archive.i
 
 void Output::carry_grid(const Archive& archive, std::size_t index)
 {
-    impl->grids.push_back({archive.impl->entries.at(index).grid, {}});
+    const auto& entry = archive.impl->entries.at(index);
+    impl->grids.push_back({entry.grid, {}, entry.opaque});
 }
 
 void Output::add_grid(std::unique_ptr<FloatGrid> grid)
 {
-    impl->grids.push_back({grid->impl->grid, std::move(grid->impl->lent)});
+    impl->grids.push_back({grid->impl->grid, std::move(grid->impl->lent), {}});
 }
 
 void Output::add_vectors(std::unique_ptr<FloatGrid> x, std::unique_ptr<FloatGrid> y, std::unique_ptr<FloatGrid> z)
 {
-    impl->grids.push_back({vectors_of(*x, *y, *z), {}});
+    impl->grids.push_back({vectors_of(*x, *y, *z), {}, {}});
 }
 
 void FloatGrid::carry(const Archive& archive, std::size_t index, bool with_transform)
@@ -370,9 +394,9 @@ std::unique_ptr<std::string> Output::write_bytes(std::uint32_t compression)
 void Output::seal()
 {
     const QuietOutput scope;
-    for (const auto& [grid, lent] : impl->grids) {
-        impl->sealed.push_back(
-            {grid->type(), grid->getName(), fingerprint(*grid, lent), *grid, grid->constTransformPtr()});
+    for (const auto& [grid, lent, opaque] : impl->grids) {
+        const std::string digest = opaque.bytes ? fingerprint(*opaque.bytes) : fingerprint(*grid, lent);
+        impl->sealed.push_back({grid->type(), grid->getName(), digest, *grid, grid->constTransformPtr()});
     }
     impl->grids.clear();
 }

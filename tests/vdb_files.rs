@@ -194,6 +194,28 @@ fn every_grid_of_every_real_file_passes_through_an_edit() {
     }
 }
 
+/// OpenVDB ends the process where an assertion about the chunks of points fails.
+#[test]
+fn points_are_carried_over_without_being_decoded() {
+    let Some(path) = shared("points_houdini16.vdb") else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let bytes = std::fs::read(path).unwrap();
+    let [damaged, out] = ["damaged.vdb", "out.vdb"].map(|name| folder.path().join(name));
+    // The sizes of chunks, and what the voxels of the tree's leaves are.
+    for (at, bit) in [(38222, 2), (38222, 4), (763, 16), (38248, 24), (38257, 8)] {
+        let mut changed = bytes.clone();
+        changed[at] ^= bit;
+        std::fs::write(&damaged, &changed).unwrap();
+        let file = open(&damaged).unwrap();
+        vdb::write(&out, &[result(&sphere(Transform::uniform(0.1), 10.0))], Some(&file), &WriteOptions::default())
+            .unwrap();
+        let written = std::fs::read(&out).unwrap();
+        // What is stored of them is there byte by byte.
+        let content = &changed[changed.len() / 2..];
+        assert!(written.windows(content.len()).any(|w| w == content), "{at}");
+    }
+}
+
 /// Every length near both ends, and many between, must be refused.
 fn assert_cuts_are_errors(bytes: &[u8], what: &str) {
     let folder = tempfile::tempdir().unwrap();
