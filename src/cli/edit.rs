@@ -30,18 +30,32 @@ pub fn run(entry: &Entry, matches: &ArgMatches, context: &Context) -> Result<()>
         return dry_run(entry.name, values, &input::probe(&paths, &input_options)?, &output, context);
     }
     let mut warnings = Vec::new();
-    let inputs = match entry.arity {
+    let mut inputs = match entry.arity {
         Arity::Source => Vec::new(),
         Arity::One | Arity::Many => input::load(&paths, &input_options, &mut warnings, &context.run)?,
         Arity::BaseAndSolid => input::load_apart(&paths, &input_options, &mut warnings, &context.run)?,
     };
-    let level_sets = inputs.iter().map(|input| input.level_set.clone()).collect();
+    let released = match (&mut inputs[..], entry.arity) {
+        ([input], Arity::One) if !preview.is_wanted() && input.level_set.grid().bytes() > MOST_KEPT => {
+            let measures = input.level_set.measure(&context.run)?;
+            Some((measures, input.release()))
+        }
+        _ => None,
+    };
+    let (before, level_sets) = match released {
+        Some((measures, level_set)) => (Some(measures), vec![level_set]),
+        None => (None, inputs.iter().map(|input| input.level_set.clone()).collect()),
+    };
     let Outcome { level_set, mut summary } = entry.run(values, level_sets, &context.run)?;
     warnings.append(&mut summary.warnings);
     summary.warnings = warnings;
-    let edit = Edit { operation: entry.name, inputs, level_set, summary, iso: 0.0, began };
+    let edit = Edit { operation: entry.name, inputs, before, level_set, summary, iso: 0.0, began };
     edit.finish(&output, &preview, args::flag(matches, "check"), context)
 }
+
+/// Bytes of an input that is kept beside its result to count the voxels that changed. Of larger ones the operator has the only copy: that
+/// takes a third off what an edit of the whole surface holds.
+const MOST_KEPT: u64 = 1 << 30;
 
 /// Says what would be done.
 pub fn dry_run(
@@ -69,6 +83,8 @@ pub struct Edit {
     pub operation: &'static str,
     /// To what; the first one counts as "before".
     pub inputs: Vec<Input>,
+    /// The measures of "before" if it was too large to be kept.
+    pub before: Option<Measures>,
     /// The result.
     pub level_set: LevelSet,
     /// What the operator has to say.
@@ -82,15 +98,13 @@ pub struct Edit {
 impl Edit {
     /// What the result is compared with: the first input, but for a conversion only if it was a level set already.
     fn before(&self) -> Option<&LevelSet> {
-        let input = self.inputs.first()?;
+        let input = self.inputs.first().filter(|_| self.before.is_none())?;
         (self.converts_nothing() || input.from().is_some_and(|(_, index)| index.is_some())).then_some(&input.level_set)
     }
 
     /// Frees the voxels of the inputs. Of large grids they would take half as much as writing the result and verifying it does.
     fn release_inputs(&mut self) {
-        for Input { level_set, .. } in &mut self.inputs {
-            *level_set = LevelSet::empty(*level_set.transform(), level_set.half_width());
-        }
+        self.inputs.iter_mut().for_each(|input| drop(input.release()));
     }
 
     fn converts_nothing(&self) -> bool {
@@ -101,9 +115,9 @@ impl Edit {
     pub fn finish(mut self, output: &Output, preview: &Preview, check: bool, context: &Context) -> Result<()> {
         let before = self.before();
         let facts = Facts {
-            before: before.map(|level_set| level_set.measure(&context.run)).transpose()?,
+            before: before.map(|level_set| level_set.measure(&context.run)).transpose()?.or(self.before),
             after: self.level_set.measure(&context.run)?,
-            voxels_changed: changed_voxels(before, &self.level_set),
+            voxels_changed: self.before.is_none().then(|| changed_voxels(before, &self.level_set)),
         };
         if check {
             output::verify(self.operation, &self.level_set)?;
@@ -139,7 +153,8 @@ impl Edit {
 struct Facts {
     before: Option<Measures>,
     after: Measures,
-    voxels_changed: u64,
+    /// `None` if the input was not kept.
+    voxels_changed: Option<u64>,
 }
 
 /// What is told of an edit.
@@ -197,7 +212,7 @@ impl Report<'_> {
             edit.began.elapsed().as_secs_f64()
         );
         // A conversion that changed nothing needs no second column.
-        let before = before.as_ref().filter(|before| *voxels_changed > 0 || *before != after);
+        let before = before.as_ref().filter(|before| *voxels_changed != Some(0) || *before != after);
         let row = |name: &str, of: fn(&Measures) -> f64| {
             let mut row = vec![name.to_owned()];
             row.extend(before.map(|before| table::number(of(before))));
@@ -222,8 +237,9 @@ impl Report<'_> {
         let changed = match (facts.before, voxels_changed) {
             // Made of a mesh, or of nothing: all of it is new.
             (None, _) => String::new(),
-            (Some(_), 0) => "no voxel changed; ".into(),
-            (Some(_), n) => format!("{} voxels changed; ", table::count(*n)),
+            (Some(_), None) => "changed voxels not counted, as the input was too large to be kept; ".into(),
+            (Some(_), Some(0)) => "no voxel changed; ".into(),
+            (Some(_), Some(n)) => format!("{} voxels changed; ", table::count(*n)),
         };
         text += &format!(
             "  {changed}{} active voxels of {} world units\n",

@@ -28,6 +28,11 @@ impl Preview {
         Ok(Self(path))
     }
 
+    /// Whether there is to be one.
+    pub fn is_wanted(&self) -> bool {
+        self.0.is_some()
+    }
+
     /// Draws and writes it.
     pub fn write(&self, before: Option<&LevelSet>, after: &LevelSet, context: &Context) -> Result<()> {
         let Some(path) = &self.0 else { return Ok(()) };

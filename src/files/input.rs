@@ -76,6 +76,12 @@ impl Input {
     pub fn from(&self) -> Option<(&Volume, Option<usize>)> {
         self.source.as_ref().map(|(volume, index)| (volume, *index))
     }
+
+    /// Takes the level set; an empty one stays.
+    pub fn release(&mut self) -> LevelSet {
+        let empty = LevelSet::empty(*self.level_set.transform(), self.level_set.half_width());
+        std::mem::replace(&mut self.level_set, empty)
+    }
 }
 
 impl InputOptions {
