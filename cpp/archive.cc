@@ -17,7 +17,7 @@
 
 #include <tbb/global_control.h>
 
-#include <algorithm>
+#include <map>
 #include <stdexcept>
 
 namespace vdb_edit {
@@ -119,7 +119,6 @@ void set_threads(std::size_t threads)
 }
 
 // --- reading ---
-
 
 Archive::Archive(std::unique_ptr<Impl> i) : impl(std::move(i)) {}
 Archive::~Archive() = default;
@@ -260,18 +259,20 @@ private:
     /// Whether points come next that can be carried over as they are: OpenVDB ends the process where an assertion about their chunks fails.
     bool is_opaque(const openvdb::GridBase& grid, const vio::GridDescriptor& descriptor) const
     {
-        const std::string type = grid.valueType();
-        return (type == "ptdataidx32" || type == "ptidx32") && !descriptor.isInstance() && inputHasGridOffsets() &&
+        return is_points(grid) && !descriptor.isInstance() && inputHasGridOffsets() &&
             fileVersion() == openvdb::OPENVDB_FILE_VERSION;
     }
 
     /// Gives grids that share the tree of another what that one is carried over by.
     static void share_opaque(std::vector<vdb_edit::Archive::Impl::Entry>& entries)
     {
+        std::map<const openvdb::TreeBase*, Opaque> known;
+        for (const auto& entry : entries) {
+            if (entry.opaque.bytes) known[&entry.grid->baseTree()] = entry.opaque;
+        }
         for (auto& entry : entries) {
-            const auto is_parent = [&](const auto& other) { return other.unique_name == entry.instance_of; };
-            const auto parent = std::find_if(entries.begin(), entries.end(), is_parent);
-            if (!entry.instance_of.empty() && parent != entries.end()) entry.opaque = parent->opaque;
+            const auto found = known.find(&entry.grid->baseTree());
+            if (found != known.end()) entry.opaque = found->second;
         }
     }
 
@@ -379,8 +380,12 @@ std::unique_ptr<Archive> fingerprint_bytes(rust::Slice<const std::uint8_t> bytes
 void release_voxels(Archive& archive, std::size_t index)
 {
     archive.impl->entries.at(index).grid->newTree();
+    trim_heap();
+}
+
+void trim_heap()
+{
 #ifdef __GLIBC__
-    // Millions of small blocks stay with the C library otherwise, in the pool of a thread that does not need them again.
     malloc_trim(0);
 #endif
 }
@@ -434,6 +439,7 @@ std::unique_ptr<Leaves> archive_component(const Archive& archive, std::size_t in
 {
     return component_of(archive.impl->entries.at(index).grid, component);
 }
+
 rust::String grid_fingerprint(const Archive& archive, std::size_t index)
 {
     const QuietOutput scope;

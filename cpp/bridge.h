@@ -70,6 +70,8 @@ std::unique_ptr<Archive> read_bytes(rust::Slice<const std::uint8_t> bytes, bool 
 
 /// Lets go of the voxels of grid `index`; its name, metadata and transform stay.
 void release_voxels(Archive& archive, std::size_t index);
+/// Gives memory that was freed back to the system, where the C library can.
+void trim_heap();
 
 /// Reads a whole file as `read_path` does and keeps only a fingerprint of each grid's voxels, for `Output::verify`.
 std::unique_ptr<Archive> fingerprint_path(rust::Slice<const std::uint8_t> path);
@@ -167,13 +169,14 @@ public:
 
 std::unique_ptr<Output> new_output();
 
-/// 128 bits that are equal for grids of equal topology and values (after rounding, for grids stored as half).
+/// 128 bits that are equal for grids of equal topology and values (after rounding, for grids stored as half); for points that are carried over as
+/// bytes, of equal bytes.
 rust::String grid_fingerprint(const Archive& archive, std::size_t index);
 
 // --- OpenVDB's own files, in reference_io.cc ---
 
-/// Writes a grid with blosc through openvdb::io::File: neither flushed to the disk nor verified.
-void plain_write(const FloatGrid& grid, rust::Slice<const std::uint8_t> path);
+/// Writes a grid through openvdb::io::File: neither flushed to the disk nor verified.
+void plain_write(const FloatGrid& grid, rust::Slice<const std::uint8_t> path, std::uint32_t compression);
 /// Reads the first float grid of a file through openvdb::io::File, voxels included.
 std::unique_ptr<FloatGrid> plain_read(rust::Slice<const std::uint8_t> path);
 

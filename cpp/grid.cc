@@ -224,6 +224,7 @@ void FloatGrid::lend(rust::Slice<const float> values, rust::Slice<const std::uin
 {
     require(values.size() == kLeafVoxels && mask.size() == kMaskWords, "lend: wrong length");
     require(impl->lent.size() < impl->leaves.size(), "lend: there is no such leaf");
+    impl->lent.reserve(impl->leaves.size());
     set_mask(*impl->leaves[impl->lent.size()], mask.data());
     impl->lent.push_back(values.data());
 }

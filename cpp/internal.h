@@ -52,7 +52,7 @@ void write_origins(const std::vector<const NodeT*>& nodes, rust::Slice<std::int3
 
 /// What a file holds of a grid that is carried over without being decoded, from the compression to the end.
 struct Opaque {
-    /// Null if the grid was decoded.
+    /// Null if the grid is not carried over so.
     std::shared_ptr<const std::string> bytes;
     /// Where in it the values begin.
     std::int64_t values = 0;
@@ -78,6 +78,7 @@ struct Archive::Impl {
     openvdb::MetaMap metadata;
     std::vector<Entry> entries;
 };
+
 /// The values of a grid's leaves if they are not in the leaves themselves: in the order in which these were added, which their transient data tell.
 using Lent = std::vector<const float*>;
 
@@ -112,6 +113,12 @@ void write_leaf(std::ostream& stream, const LeafNode& leaf, const float* values,
 /// 128 bits, as hexadecimal digits, of a grid of any type; grids stored as half compare as rounded. Of a grid of floats hashes of its leaves stand
 /// for the values.
 std::string fingerprint(const openvdb::GridBase& grid, const Lent& lent = {});
+
+inline bool is_points(const openvdb::GridBase& grid)
+{
+    const std::string type = grid.valueType();
+    return type == "ptdataidx32" || type == "ptidx32";
+}
 
 /// 128 bits of bytes, as hexadecimal digits.
 std::string fingerprint(const std::string& bytes);

@@ -157,8 +157,8 @@ struct StoredLeaves {
     vio::DelayedLoadMetadata index;
 };
 
-/// How the inactive values of a stored leaf are told from each other.
-std::int8_t kind_of(const std::string& bytes, std::size_t leaf) { return bytes[leaf + sizeof(LeafNode::NodeMaskType)]; }
+/// How the inactive values of the stored leaf that begins at a byte are told from each other.
+std::int8_t kind_of(const std::string& bytes, std::size_t begin) { return bytes[begin + sizeof(LeafNode::NodeMaskType)]; }
 
 /// Where the active values of a stored leaf begin: after its mask, its kind, up to two inactive values, and which of the two is where.
 std::size_t values_begin(std::int8_t kind)
@@ -192,6 +192,8 @@ StoredLeaves store_leaves(
         vio::StreamMetadata::Ptr tag(new vio::StreamMetadata);
         BytesBuffer buffer;
         std::ostream stream(&buffer);
+        // What the buffer throws is passed on.
+        stream.exceptions(std::ios_base::badbit | std::ios_base::failbit);
         vio::setStreamMetadataPtr(stream, tag, /*transfer=*/false);
         vio::setDataCompression(stream, of_grid);
         vio::setGridBackgroundValuePtr(stream, &background);
@@ -210,8 +212,10 @@ StoredLeaves store_leaves(
                 size = 8 + vio::writeCompressedValuesSize(values, LeafNode::SIZE, leaves[i]->getValueMask(),
                                static_cast<std::uint8_t>(kind), half, of_file);
             }
+            // Where no voxel is active, halves have no size in the file, but one in the index.
             out.index.setCompressedSize(i, static_cast<std::int64_t>(std::max<std::size_t>(size, 8)));
         }
+        buffer.bytes.shrink_to_fit();
         out.blocks[block] = std::move(buffer.bytes);
     });
     return out;
@@ -236,6 +240,25 @@ public:
         write_grids(stream, content.grids);
         stream.flush();
         identified.identify(getUniqueTag());
+    }
+
+    /// A grid as a file with blosc holds it.
+    Opaque store(const openvdb::GridBase::ConstPtr& grid)
+    {
+        std::stringbuf buffer(std::ios_base::in | std::ios_base::out | std::ios_base::binary);
+        std::ostream stream(&buffer);
+        stream.exceptions(std::ios_base::badbit | std::ios_base::failbit);
+        vio::StreamMetadata::Ptr tag(new vio::StreamMetadata);
+        vio::setStreamMetadataPtr(stream, tag, /*transfer=*/false);
+        setCompression(vio::COMPRESS_BLOSC | vio::COMPRESS_ACTIVE_MASK);
+        vio::setDataCompression(stream, compression());
+        vio::setWriteGridStatsMetadata(stream, isGridStatsMetadataEnabled());
+        vio::GridDescriptor descriptor(grid->getName(), grid->type(), grid->saveFloatAsHalf());
+        writeGrid(descriptor, grid, stream, /*seekable=*/true);
+        const std::int64_t begin = descriptor.getGridPos(), end = descriptor.getEndPos();
+        const std::string all = buffer.str();
+        auto bytes = std::make_shared<std::string>(all.substr(static_cast<std::size_t>(begin), static_cast<std::size_t>(end - begin)));
+        return {std::move(bytes), descriptor.getBlockPos() - begin};
     }
 
 private:
@@ -308,7 +331,7 @@ private:
         std::ostream& stream, vio::GridDescriptor& descriptor, const openvdb::FloatGrid& grid, const Lent& lent)
     {
         setGridCompression(stream, grid);
-        const StoredLeaves leaves = store_leaves(grid, lent, vio::getDataCompression(stream), compression());
+        StoredLeaves leaves = store_leaves(grid, lent, vio::getDataCompression(stream), compression());
 
         const openvdb::GridBase& base = grid;
         const auto described = openvdb::ConstPtrCast<openvdb::GridBase>(base.copyGrid());
@@ -325,8 +348,9 @@ private:
         base.writeTopology(stream);
 
         descriptor.setBlockPos(stream.tellp());
-        for (const std::string& block : leaves.blocks) {
+        for (std::string& block : leaves.blocks) {
             stream.write(block.data(), static_cast<std::streamsize>(block.size()));
+            std::string().swap(block);
         }
     }
 };
@@ -347,11 +371,15 @@ void Output::carry_metadata(const Archive& archive) { impl->metadata = archive.i
 void Output::carry_grid(const Archive& archive, std::size_t index)
 {
     const auto& entry = archive.impl->entries.at(index);
-    impl->grids.push_back({entry.grid, {}, entry.opaque});
+    const QuietOutput scope;
+    const bool is_decoded = is_points(*entry.grid) && !entry.opaque.bytes;
+    impl->grids.push_back({entry.grid, {}, is_decoded ? Writer().store(entry.grid) : entry.opaque});
 }
 
 void Output::add_grid(std::unique_ptr<FloatGrid> grid)
 {
+    const Lent& lent = grid->impl->lent;
+    require(lent.empty() || lent.size() == grid->impl->leaves.size(), "add_grid: not all leaves were lent");
     impl->grids.push_back({grid->impl->grid, std::move(grid->impl->lent), {}});
 }
 
@@ -394,8 +422,11 @@ std::unique_ptr<std::string> Output::write_bytes(std::uint32_t compression)
 void Output::seal()
 {
     const QuietOutput scope;
+    // Grids that share a tree are one in the file.
+    std::map<const openvdb::TreeBase*, std::string> digests;
     for (const auto& [grid, lent, opaque] : impl->grids) {
-        const std::string digest = opaque.bytes ? fingerprint(*opaque.bytes) : fingerprint(*grid, lent);
+        std::string& digest = digests[&grid->baseTree()];
+        if (digest.empty()) digest = opaque.bytes ? fingerprint(*opaque.bytes) : fingerprint(*grid, lent);
         impl->sealed.push_back({grid->type(), grid->getName(), digest, *grid, grid->constTransformPtr()});
     }
     impl->grids.clear();

@@ -1,28 +1,19 @@
 // Files as any program writes and reads them through OpenVDB's own interface: what ours are timed against.
 
 #include "internal.h"
+#include "streams.h"
 
-#include <openvdb/io/Compression.h>
 #include <openvdb/io/File.h>
 
 #include <stdexcept>
 
 namespace vdb_edit {
 
-namespace {
-
-std::string path_string(rust::Slice<const std::uint8_t> path)
-{
-    return {reinterpret_cast<const char*>(path.data()), path.size()};
-}
-
-} // namespace
-
-void plain_write(const FloatGrid& grid, rust::Slice<const std::uint8_t> path)
+void plain_write(const FloatGrid& grid, rust::Slice<const std::uint8_t> path, std::uint32_t compression)
 {
     const QuietOutput scope;
     openvdb::io::File file(path_string(path));
-    file.setCompression(openvdb::io::COMPRESS_BLOSC | openvdb::io::COMPRESS_ACTIVE_MASK);
+    file.setCompression(compression);
     file.write(openvdb::GridCPtrVec{grid.impl->grid});
     file.close();
 }

@@ -96,6 +96,7 @@ openvdb::GridBase::Ptr vectors_of(const FloatGrid& x, const FloatGrid& y, const 
     using LeafT = TreeT::LeafNodeType;
     auto grid = openvdb::gridPtrCast<openvdb::Vec3SGrid>(openvdb::GridBase::createGrid("Tree_vec3s_5_4_3"));
     if (!grid) throw std::runtime_error("OpenVDB does not know its own vector grids");
+    require(x.impl->lent.empty() && y.impl->lent.empty() && z.impl->lent.empty(), "components are copied, not lent");
     const std::vector<LeafNode*>* parts[3] = {&x.impl->leaves, &y.impl->leaves, &z.impl->leaves};
     require(parts[0]->size() == parts[1]->size() && parts[0]->size() == parts[2]->size(), "components differ in their leaves");
     openvdb::tree::ValueAccessor<TreeT> accessor(grid->tree());

@@ -11,6 +11,7 @@ command -v valgrind >/dev/null || { echo 'valgrind is missing (Debian: apt-get i
 tests=("$@")
 [ $# -gt 0 ] || tests=(vdb_files vdb_reference)
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-target}/sanitize
+mkdir -p "$CARGO_TARGET_DIR"
 export CXXFLAGS='-g -fsanitize=undefined -fsanitize-undefined-trap-on-error -fno-sanitize=vptr'
 build=()
 for test in "${tests[@]}"; do build+=(--test "$test"); done

@@ -214,6 +214,13 @@ fn points_are_carried_over_without_being_decoded() {
         let content = &changed[changed.len() / 2..];
         assert!(written.windows(content.len()).any(|w| w == content), "{at}");
     }
+    // A file without offsets, as written to a pipe, has to be decoded.
+    let mut streamed = bytes;
+    streamed[20] = 0;
+    std::fs::write(&damaged, &streamed).unwrap();
+    let file = open(&damaged).unwrap();
+    vdb::write(&out, &[], Some(&file), &WriteOptions::default()).unwrap();
+    assert_same_except(file.listing(), open(&out).unwrap().listing(), None);
 }
 
 /// Every length near both ends, and many between, must be refused.
@@ -358,18 +365,30 @@ fn files_are_those_that_openvdb_writes() {
     let noise = LevelSet::new(grid, Transform::uniform(0.1));
     let empty = LevelSet::empty(Transform::uniform(0.1), 3.0);
     for (n, level_set) in [sphere(Transform::uniform(0.1), 150.0), noise, empty].into_iter().enumerate() {
-        let [plain, ours] = ["plain.vdb", "ours.vdb"].map(|name| folder.path().join(name));
-        ReferenceGrid::from_level_set(&level_set).unwrap().write(&plain).unwrap();
-        let file = open(&plain).unwrap();
-        let grid = GridToWrite { level_set: &level_set, name: None, replaces: Some(0) };
-        vdb::write(&ours, &[grid], Some(&file), &WriteOptions::default()).unwrap();
-        let bytes = [plain, ours].map(|path| {
-            let mut bytes = std::fs::read(path).unwrap();
-            // The identity: OpenVDB makes one up for every file.
-            bytes[21..57].fill(0);
-            bytes
-        });
-        assert!(bytes[0] == bytes[1], "{n}: {} and {} bytes", bytes[0].len(), bytes[1].len());
+        for compression in [Compression::Blosc, Compression::Zip, Compression::None] {
+            for precision in [Precision::Float, Precision::Half] {
+                let [plain, ours] = ["plain.vdb", "ours.vdb"].map(|name| folder.path().join(name));
+                let options = WriteOptions {
+                    compression: Some(compression),
+                    precision: Some(precision),
+                    ..WriteOptions::default()
+                };
+                ReferenceGrid::from_level_set(&level_set).unwrap().write(&plain, &options).unwrap();
+                let file = open(&plain).unwrap();
+                let grid = GridToWrite { level_set: &level_set, name: None, replaces: Some(0) };
+                vdb::write(&ours, &[grid], Some(&file), &options).unwrap();
+                let carried = folder.path().join("carried.vdb");
+                vdb::write(&carried, &[], Some(&file), &options).unwrap();
+                let [plain, ours, carried] = [plain, ours, carried].map(|path| {
+                    let mut bytes = std::fs::read(path).unwrap();
+                    // The identity: OpenVDB makes one up for every file.
+                    bytes[21..57].fill(0);
+                    bytes
+                });
+                let what = format!("{n} {compression:?} {precision:?}: {} {}", plain.len(), ours.len());
+                assert!(plain == ours && plain == carried, "{what} {}", carried.len());
+            }
+        }
     }
 }
 

@@ -131,7 +131,7 @@ fn run(matches: &ArgMatches, context: &Context) -> Result<()> {
         at = 0.0;
     }
     let summary = Summary { warnings, ..Summary::default() };
-    let edit = Edit { operation: "convert", inputs, before: None, level_set, summary, iso: at, began };
+    let edit = Edit { operation: "convert", inputs, measured_before: None, level_set, summary, iso: at, began };
     edit.finish(&output, &preview, args::flag(matches, "check"), context)
 }
 

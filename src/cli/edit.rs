@@ -12,6 +12,7 @@ use super::{args, files, options, table};
 use crate::error::Result;
 use crate::files::input::{self, Input};
 use crate::files::output::{self, Output, Written};
+use crate::files::volume;
 use crate::levelset::{LevelSet, Measures};
 use crate::mesh::transfer_attributes;
 use crate::ops::compare::changed_voxels;
@@ -38,23 +39,24 @@ pub fn run(entry: &Entry, matches: &ArgMatches, context: &Context) -> Result<()>
     let released = match (&mut inputs[..], entry.arity) {
         ([input], Arity::One) if !preview.is_wanted() && input.level_set.grid().bytes() > MOST_KEPT => {
             let measures = input.level_set.measure(&context.run)?;
+            volume::trim_heap();
             Some((measures, input.release()))
         }
         _ => None,
     };
-    let (before, level_sets) = match released {
+    let (measured_before, level_sets) = match released {
         Some((measures, level_set)) => (Some(measures), vec![level_set]),
         None => (None, inputs.iter().map(|input| input.level_set.clone()).collect()),
     };
     let Outcome { level_set, mut summary } = entry.run(values, level_sets, &context.run)?;
     warnings.append(&mut summary.warnings);
     summary.warnings = warnings;
-    let edit = Edit { operation: entry.name, inputs, before, level_set, summary, iso: 0.0, began };
+    let edit = Edit { operation: entry.name, inputs, measured_before, level_set, summary, iso: 0.0, began };
     edit.finish(&output, &preview, args::flag(matches, "check"), context)
 }
 
 /// Bytes of an input that is kept beside its result to count the voxels that changed. Of larger ones the operator has the only copy: that
-/// takes a third off what an edit of the whole surface holds.
+/// takes a third off what an edit of the whole surface holds. With grids of that size, memory that was freed is given back to the system in between.
 const MOST_KEPT: u64 = 1 << 30;
 
 /// Says what would be done.
@@ -84,7 +86,7 @@ pub struct Edit {
     /// To what; the first one counts as "before".
     pub inputs: Vec<Input>,
     /// The measures of "before" if it was too large to be kept.
-    pub before: Option<Measures>,
+    pub measured_before: Option<Measures>,
     /// The result.
     pub level_set: LevelSet,
     /// What the operator has to say.
@@ -98,7 +100,7 @@ pub struct Edit {
 impl Edit {
     /// What the result is compared with: the first input, but for a conversion only if it was a level set already.
     fn before(&self) -> Option<&LevelSet> {
-        let input = self.inputs.first().filter(|_| self.before.is_none())?;
+        let input = self.inputs.first().filter(|_| self.measured_before.is_none())?;
         (self.converts_nothing() || input.from().is_some_and(|(_, index)| index.is_some())).then_some(&input.level_set)
     }
 
@@ -115,15 +117,18 @@ impl Edit {
     pub fn finish(mut self, output: &Output, preview: &Preview, check: bool, context: &Context) -> Result<()> {
         let before = self.before();
         let facts = Facts {
-            before: before.map(|level_set| level_set.measure(&context.run)).transpose()?.or(self.before),
+            before: before.map(|level_set| level_set.measure(&context.run)).transpose()?.or(self.measured_before),
             after: self.level_set.measure(&context.run)?,
-            voxels_changed: self.before.is_none().then(|| changed_voxels(before, &self.level_set)),
+            voxels_changed: self.measured_before.is_none().then(|| changed_voxels(before, &self.level_set)),
         };
         if check {
             output::verify(self.operation, &self.level_set)?;
         }
         preview.write(before, &self.level_set, context)?;
         self.release_inputs();
+        if self.level_set.grid().bytes() > MOST_KEPT {
+            volume::trim_heap();
+        }
         let from = self.inputs.iter().find_map(Input::from);
         let Written { bytes, warnings, details } = match &self.summary.colored {
             Some(mesh) => {

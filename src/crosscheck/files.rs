@@ -42,7 +42,7 @@ pub(super) struct Reading<'a> {
 impl<'a> Reading<'a> {
     pub fn boxed(input: &'a Input<'a>) -> Result<Box<dyn Contest + 'a>> {
         let files = Files::new()?;
-        ReferenceGrid::from_level_set(input.level_set)?.write(&files.ours)?;
+        ReferenceGrid::from_level_set(input.level_set)?.write(&files.ours, &WriteOptions::default())?;
         Ok(Box::new(Self { input, files, ours: None, theirs: None }))
     }
 }
@@ -95,7 +95,7 @@ impl Contest for Writing<'_> {
     }
 
     fn theirs(&mut self) -> Result<f64> {
-        Ok(timed(|| self.reference.write(&self.files.theirs))?.1)
+        Ok(timed(|| self.reference.write(&self.files.theirs, &WriteOptions::default()))?.1)
     }
 
     fn difference(&self) -> Result<Difference> {

@@ -12,6 +12,7 @@ use crate::levelset::{Field, LevelSet};
 use crate::run::RunOptions;
 use crate::scan::Inside;
 pub use crate::vdb::FieldToWrite;
+pub use crate::vdb::trim_heap;
 use crate::vdb::{
     Band, Compression, GridListing, GridToWrite, MetaItem, Precision, ReadLevelSet, VdbFile, VectorsToWrite,
     WriteOptions,

@@ -341,6 +341,11 @@ fn accepted(property: &Value, value: &Value, error: &str) -> String {
         ("integer", ..) => "a whole number".to_owned(),
         ("number", ..) => "a number".to_owned(),
         ("boolean", ..) => "true or false".to_owned(),
+        ("string", ..) => "a text".to_owned(),
+        ("array", ..) => match property.get("minItems").and_then(Value::as_u64) {
+            Some(count) => format!("a list of {count} numbers"),
+            None => "a list".to_owned(),
+        },
         _ => kind.replace('|', ", "),
     }
 }

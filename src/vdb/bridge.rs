@@ -77,6 +77,7 @@ pub(super) mod ffi {
         fn fingerprint_path(path: &[u8]) -> Result<UniquePtr<Archive>>;
         fn fingerprint_bytes(bytes: &[u8]) -> Result<UniquePtr<Archive>>;
         fn release_voxels(archive: Pin<&mut Archive>, index: usize) -> Result<()>;
+        fn trim_heap();
         fn grid_fingerprint(archive: &Archive, index: usize) -> Result<String>;
 
         type Leaves;
@@ -126,7 +127,7 @@ pub(super) mod ffi {
         fn seal(self: Pin<&mut Output>) -> Result<()>;
         fn verify(self: &Output, archive: &Archive) -> Result<String>;
 
-        fn plain_write(grid: &FloatGrid, path: &[u8]) -> Result<()>;
+        fn plain_write(grid: &FloatGrid, path: &[u8], compression: u32) -> Result<()>;
         fn plain_read(path: &[u8]) -> Result<UniquePtr<FloatGrid>>;
 
         type RawMesh;
@@ -188,5 +189,5 @@ unsafe impl Send for ffi::Leaves {}
 unsafe impl Sync for ffi::Leaves {}
 // SAFETY: a heap object without ties to its thread.
 unsafe impl Send for ffi::FloatGrid {}
-// SAFETY: `&self` functions read, except `fill`, which writes leaves that the callers in `io` keep disjoint.
+// SAFETY: `&self` functions read, except `fill`, which writes leaves that the caller in `write` keeps disjoint.
 unsafe impl Sync for ffi::FloatGrid {}

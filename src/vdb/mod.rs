@@ -23,7 +23,7 @@ mod write;
 
 pub use band::{Band, BandFacts, Range, diagnose_band};
 pub use listing::{Compression, FileListing, GridListing, MetaItem, Precision};
-pub use read::{ReadLevelSet, VdbFile, library_version, list, open, set_threads};
+pub use read::{ReadLevelSet, VdbFile, library_version, list, open, set_threads, trim_heap};
 pub use write::{
     FieldToWrite, GridToWrite, VectorsToWrite, WriteOptions, WriteReport, write, write_with_fields, write_with_vectors,
 };

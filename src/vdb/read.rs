@@ -128,6 +128,12 @@ pub fn set_threads(threads: usize) -> Result<()> {
     ffi::set_threads(threads).map_err(|e| EditError::parameter("OpenVDB", "threads", threads, e.what()))
 }
 
+/// Gives memory that was freed back to the system. The C library keeps millions of small blocks otherwise, in the pools of threads that may not need
+/// them again.
+pub fn trim_heap() {
+    ffi::trim_heap();
+}
+
 /// Version of the OpenVDB library in use.
 pub fn library_version() -> String {
     ffi::library_version().unwrap_or_else(|_| "unknown".into())

@@ -9,8 +9,9 @@ use cxx::UniquePtr;
 use glam::Vec3;
 
 use super::bridge::ffi;
+use super::listing::{Compression, Precision};
 use super::read::read_grid;
-use super::write::{Values, matrix, to_openvdb};
+use super::write::{WriteOptions, copy_leaves, matrix, to_openvdb};
 use crate::error::{EditError, Result};
 use crate::grid::Transform;
 use crate::levelset::LevelSet;
@@ -131,7 +132,7 @@ fn failed(e: cxx::Exception) -> EditError {
 impl ReferenceGrid {
     /// A copy of a level set.
     pub fn from_level_set(level_set: &LevelSet) -> Result<Self> {
-        Ok(Self { grid: to_openvdb(level_set, Values::Copied).map_err(failed)?, transform: *level_set.transform() })
+        Ok(Self { grid: to_openvdb(level_set, copy_leaves).map_err(failed)?, transform: *level_set.transform() })
     }
 
     /// A copy as a level set of ours: values, masks and signs.
@@ -243,9 +244,11 @@ impl ReferenceGrid {
         Ok(ReferenceMesh { raw: ffi::volume_to_mesh(&self.grid, iso, adaptivity).map_err(failed)? })
     }
 
-    /// Writes a file of this grid alone through OpenVDB's own interface: blosc, neither flushed nor verified.
-    pub fn write(&self, path: &Path) -> Result<()> {
-        ffi::plain_write(&self.grid, path.as_os_str().as_encoded_bytes()).map_err(failed)
+    /// Writes a file of this grid alone through OpenVDB's own interface, neither flushed nor verified; float and blosc if `options` say nothing.
+    pub fn write(&mut self, path: &Path, options: &WriteOptions) -> Result<()> {
+        self.grid.pin_mut().set_half(options.precision == Some(Precision::Half)).map_err(failed)?;
+        let compression = options.compression.unwrap_or(Compression::Blosc).flags();
+        ffi::plain_write(&self.grid, path.as_os_str().as_encoded_bytes(), compression).map_err(failed)
     }
 
     /// Reads the float grid of a file through OpenVDB's own interface, voxels included; `transform` is what it has.

@@ -26,7 +26,7 @@ const CREATOR: &str = concat!("vdb-edit ", env!("CARGO_PKG_VERSION"));
 pub struct WriteOptions {
     /// How the values of the written level sets are stored; `None` keeps that of the grid they replace.
     pub precision: Option<Precision>,
-    /// How the file is compressed; `None` keeps that of the input.
+    /// How the file is compressed; `None` keeps that of the input. Points keep what they have.
     pub compression: Option<Compression>,
     /// Leaves the other grids of the input out.
     pub only_result: bool,
@@ -130,16 +130,20 @@ fn write_all(
             file.check_present(index)?;
         }
     }
-    let (mut content, mut count) = collect(grids, input, options).map_err(|e| output.error(e.what()))?;
+    // SAFETY: the level sets are borrowed for longer than `content` lives.
+    let collected = unsafe { collect(grids, input, options) };
+    let (mut content, mut count) = collected.map_err(|e| output.error(e.what()))?;
     for field in fields {
-        let made = to_openvdb_field(field, Values::Lent, options).and_then(|grid| content.pin_mut().add_grid(grid));
-        made.map_err(|e| output.error(e.what()))?;
+        // SAFETY: as above.
+        let made = to_openvdb_field(field, |grid, of| unsafe { lend_leaves(grid, of) }, options);
+        let added = made.and_then(|grid| content.pin_mut().add_grid(grid));
+        added.map_err(|e| output.error(e.what()))?;
         count += 1;
     }
     if let Some(VectorsToWrite { components: [x, y, z], name }) = vectors {
         // Halves are compared after rounding for grids of floats alone.
         let whole = WriteOptions { precision: None, ..options.clone() };
-        let component = |field| to_openvdb_field(&FieldToWrite { field, name }, Values::Copied, &whole);
+        let component = |field| to_openvdb_field(&FieldToWrite { field, name }, copy_leaves, &whole);
         let mut add = || content.pin_mut().add_vectors(component(x)?, component(y)?, component(z)?);
         add().map_err(|e| output.error(e.what()))?;
         count += 1;
@@ -154,18 +158,23 @@ fn write_all(
 }
 
 /// All grids of the file to be, in order.
-fn collect(
+///
+/// # Safety
+/// The level sets stay as they are for as long as the output lives.
+unsafe fn collect(
     grids: &[GridToWrite<'_>],
     input: Option<&VdbFile>,
     options: &WriteOptions,
 ) -> Result<(UniquePtr<ffi::Output>, usize), cxx::Exception> {
     let mut content = ffi::new_output()?;
     let mut count = 0;
+    // SAFETY: as this function.
+    let lent = |grid: &GridToWrite<'_>, input| unsafe { to_openvdb_grid(grid, input, options) };
     if let Some(file) = input {
         content.pin_mut().carry_metadata(&file.archive)?;
         for index in 0..file.listing().grids.len() {
             if let Some(grid) = grids.iter().find(|g| g.replaces == Some(index)) {
-                content.pin_mut().add_grid(to_openvdb_grid(grid, input, options)?)?;
+                content.pin_mut().add_grid(lent(grid, input)?)?;
             } else if !options.only_result {
                 content.pin_mut().carry_grid(&file.archive, index)?;
             } else {
@@ -176,18 +185,21 @@ fn collect(
     }
     let known = input.map_or(0, |file| file.listing().grids.len());
     for grid in grids.iter().filter(|g| g.replaces.is_none_or(|index| index >= known)) {
-        content.pin_mut().add_grid(to_openvdb_grid(grid, None, options)?)?;
+        content.pin_mut().add_grid(lent(grid, None)?)?;
         count += 1;
     }
     Ok((content, count))
 }
 
-fn to_openvdb_grid(
+/// # Safety
+/// As [`lend_leaves`].
+unsafe fn to_openvdb_grid(
     grid: &GridToWrite<'_>,
     input: Option<&VdbFile>,
     options: &WriteOptions,
 ) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
-    let mut made = to_openvdb(grid.level_set, Values::Lent)?;
+    // SAFETY: as this function.
+    let mut made = to_openvdb(grid.level_set, |made, of| unsafe { lend_leaves(made, of) })?;
     let mut precision = options.precision;
     if let (Some(file), Some(index)) = (input, grid.replaces) {
         let listing = &file.listing().grids[index];
@@ -207,12 +219,12 @@ fn to_openvdb_grid(
 
 fn to_openvdb_field(
     to_write: &FieldToWrite<'_>,
-    values: Values,
+    add_leaves: impl AddLeaves,
     options: &WriteOptions,
 ) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
     let FieldToWrite { field, name } = to_write;
     let mut made = ffi::new_float_grid(0.0)?;
-    fill(made.pin_mut(), field.grid(), values)?;
+    add_leaves(made.pin_mut(), field.grid())?;
     made.pin_mut().set_affine(&matrix(field.transform()))?;
     made.pin_mut().set_creator(CREATOR)?;
     made.pin_mut().set_name(name)?;
@@ -220,20 +232,19 @@ fn to_openvdb_field(
     Ok(made)
 }
 
-/// Where the values of an OpenVDB grid are.
-#[derive(Clone, Copy)]
-pub(super) enum Values {
-    /// In its own leaves.
-    Copied,
-    /// Where ours are, which must outlive it and what it is written by: nothing but an output may use the grid.
-    Lent,
-}
+/// How the leaves of a grid come into one of OpenVDB's.
+pub(super) trait AddLeaves: Fn(Pin<&mut ffi::FloatGrid>, &Grid) -> Result<(), cxx::Exception> {}
+
+impl<F: Fn(Pin<&mut ffi::FloatGrid>, &Grid) -> Result<(), cxx::Exception>> AddLeaves for F {}
 
 /// A level set in OpenVDB's own tree: all leaves, and the inside as tiles.
-pub(super) fn to_openvdb(level_set: &LevelSet, values: Values) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
+pub(super) fn to_openvdb(
+    level_set: &LevelSet,
+    add_leaves: impl AddLeaves,
+) -> Result<UniquePtr<ffi::FloatGrid>, cxx::Exception> {
     let grid = level_set.grid();
     let mut made = ffi::new_level_set(f64::from(grid.background()))?;
-    fill(made.pin_mut(), grid, values)?;
+    add_leaves(made.pin_mut(), grid)?;
     let value = -grid.background();
     let tiles: Vec<ffi::Tile> = grid
         .inside_tiles()
@@ -252,23 +263,29 @@ pub(super) fn matrix(transform: &Transform) -> [f64; 16] {
     [x.x, y.x, z.x, t.x, x.y, y.y, z.y, t.y, x.z, y.z, z.z, t.z, 0.0, 0.0, 0.0, 1.0]
 }
 
-fn fill(mut made: Pin<&mut ffi::FloatGrid>, grid: &Grid, values: Values) -> Result<(), cxx::Exception> {
-    let ids = grid.leaves();
-    let origins: Vec<i32> = ids.iter().flat_map(|&id| grid.origin(id).to_array()).collect();
-    made.as_mut().add_leaves(&origins)?;
-    match values {
-        Values::Copied => {
-            let made = made.as_ref().get_ref();
-            ids.par_iter().with_min_len(16).enumerate().try_for_each(|(index, &id)| {
-                // SAFETY: every task fills another leaf.
-                unsafe { made.fill(index, &grid.values(id).0, &grid.mask(id).0) }
-            })
-        }
-        Values::Lent => ids.iter().try_for_each(|&id| {
-            // SAFETY: `write_all` borrows the grid for longer than what it writes lives.
-            unsafe { made.as_mut().lend(&grid.values(id).0, &grid.mask(id).0) }
-        }),
-    }
+fn add_origins(made: Pin<&mut ffi::FloatGrid>, grid: &Grid) -> Result<(), cxx::Exception> {
+    let origins: Vec<i32> = grid.leaves().iter().flat_map(|&id| grid.origin(id).to_array()).collect();
+    made.add_leaves(&origins)
+}
+
+/// Adds leaves with values of their own.
+pub(super) fn copy_leaves(mut made: Pin<&mut ffi::FloatGrid>, grid: &Grid) -> Result<(), cxx::Exception> {
+    add_origins(made.as_mut(), grid)?;
+    let made = made.as_ref().get_ref();
+    grid.leaves().par_iter().with_min_len(16).enumerate().try_for_each(|(index, &id)| {
+        // SAFETY: every task fills another leaf.
+        unsafe { made.fill(index, &grid.values(id).0, &grid.mask(id).0) }
+    })
+}
+
+/// Adds leaves whose values stay in the grid: for an output only.
+///
+/// # Safety
+/// The grid stays as it is for as long as what was made, and the output that it is added to, live.
+unsafe fn lend_leaves(mut made: Pin<&mut ffi::FloatGrid>, grid: &Grid) -> Result<(), cxx::Exception> {
+    add_origins(made.as_mut(), grid)?;
+    // SAFETY: as this function.
+    grid.leaves().iter().try_for_each(|&id| unsafe { made.as_mut().lend(&grid.values(id).0, &grid.mask(id).0) })
 }
 
 /// Where a file goes.
@@ -307,12 +324,7 @@ impl Target<'_> {
     }
 
     /// To a pipe or device: verified in memory first.
-    fn write_through(
-        &self,
-        mut content: Pin<&mut ffi::Output>,
-        compression: u32,
-        mut to: impl Write,
-    ) -> Result<u64> {
+    fn write_through(&self, mut content: Pin<&mut ffi::Output>, compression: u32, mut to: impl Write) -> Result<u64> {
         let bytes = content.as_mut().write_bytes(compression).map_err(|e| self.error(e.what()))?;
         content.as_mut().seal().map_err(|e| self.error(e.what()))?;
         self.verify(&content, || ffi::fingerprint_bytes(bytes.as_bytes()))?;
