@@ -327,10 +327,10 @@ fn accepted(property: &Value, value: &Value, error: &str) -> String {
     let kind = kind_of(property);
     // Errors of serde's own speak of types.
     let is_serdes = |kinds: &[&str]| kinds.iter().any(|kind| error.starts_with(kind));
-    if is_serdes(&["unknown variant"]) {
+    if is_serdes(&["unknown variant"]) && kind.contains('|') {
         return suggest(value.as_str().unwrap_or_default(), kind.split('|'));
     }
-    if !is_serdes(&["invalid type", "invalid value", "data did not match"]) {
+    if !is_serdes(&["unknown variant", "invalid type", "invalid value", "data did not match"]) {
         return format!("{error}; expected {kind}");
     }
     let bound = |name| property.get(name).and_then(Value::as_i64);
