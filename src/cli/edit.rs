@@ -109,12 +109,20 @@ impl Edit {
         self.inputs.iter_mut().for_each(|input| drop(input.release()));
     }
 
+    /// Gives back to the system what the operator or the inputs held, if the grids are so large that it matters.
+    fn trim_heap(&self) {
+        if self.level_set.grid().bytes() > MOST_KEPT {
+            volume::trim_heap();
+        }
+    }
+
     fn converts_nothing(&self) -> bool {
         self.operation != super::convert::VERB.name
     }
 
     /// Verifies, draws and writes the result, then tells what changed.
     pub fn finish(mut self, output: &Output, preview: &Preview, check: bool, context: &Context) -> Result<()> {
+        self.trim_heap();
         let before = self.before();
         let facts = Facts {
             before: before.map(|level_set| level_set.measure(&context.run)).transpose()?.or(self.measured_before),
@@ -126,9 +134,7 @@ impl Edit {
         }
         preview.write(before, &self.level_set, context)?;
         self.release_inputs();
-        if self.level_set.grid().bytes() > MOST_KEPT {
-            volume::trim_heap();
-        }
+        self.trim_heap();
         let from = self.inputs.iter().find_map(Input::from);
         let Written { bytes, warnings, details } = match &self.summary.colored {
             Some(mesh) => {
