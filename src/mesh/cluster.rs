@@ -351,28 +351,30 @@ fn axes_about(direction: Vec3) -> [Vec3; 3] {
     [normal, second, normal.cross(second)]
 }
 
-/// Squares of the distances of `N`³ voxels, a voxel apart, from the nearest triangle of the candidates, up to a limit.
+/// Squares of the distances of `N`³ voxels, a voxel apart, from the nearest triangle of the candidates, each up to a limit.
 pub(super) struct Query<'a, const N: usize> {
     pub candidates: &'a Candidates,
     pub clusters: &'a Clusters,
     /// The first voxel.
     pub first: Vec3,
-    pub limit_squared: f32,
-    /// A cluster that is likely near; afterwards one that was nearest to a voxel of the last row.
-    pub guess: &'a mut u32,
-    /// The result, by rows along z.
-    pub out: &'a mut [[f32; N]],
+    /// Clusters that are likely near; afterwards those nearest to the first and the last voxel of the last row.
+    pub guesses: &'a mut [u32; 2],
+    /// The squares of the limits, by rows along z; afterwards the result.
+    pub squared: &'a mut [[f32; N]],
 }
 
 impl<const N: usize> Work for Query<'_, N> {
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
-        for row in 0..N * N {
-            let first = self.first + Vec3::new((row / N) as f32, (row % N) as f32, 0.0);
-            let squares = self.row(simd, first);
-            if let Some(out) = self.out.get_mut(row) {
-                *out = squares;
-            }
+        for step in 0..N * N {
+            // There and back, so that each row is beside the last one.
+            let (x, y) = (step / N, step % N);
+            let y = if x % 2 == 0 { y } else { N - 1 - y };
+            let row = x * N + y;
+            let first = self.first + Vec3::new(x as f32, y as f32, 0.0);
+            let Some(&limits) = self.squared.get(row) else { return };
+            let squares = self.row(simd, first, limits);
+            self.squared[row] = squares;
         }
     }
 }
@@ -380,21 +382,36 @@ impl<const N: usize> Work for Query<'_, N> {
 impl<const N: usize> Query<'_, N> {
     /// A row at a time, so that the work on one voxel goes on while the others wait for results.
     #[inline(always)]
-    fn row<S: Simd>(&mut self, simd: S, first: Vec3) -> [f32; N] {
+    fn row<S: Simd>(&mut self, simd: S, first: Vec3, limits: [f32; N]) -> [f32; N] {
         let clusters = &self.clusters.all;
-        let mut best = [Lanes::splat(simd, self.limit_squared); N];
+        let [of_first, of_last] = *self.guesses;
+        let mut best = [Lanes::splat(simd, 0.0); N];
+        for k in 0..N {
+            best[k] = Lanes::splat(simd, limits[k]);
+        }
+        // By lane, what is nearest to the first and to the last voxel.
+        let mut nearest = [Lanes::splat(simd, of_first as f32), Lanes::splat(simd, of_last as f32)];
+        macro_rules! look_at {
+            ($of:expr) => {
+                if let Some(cluster) = clusters.get($of as usize) {
+                    let squares = cluster.distances_squared::<S, N>(simd, first);
+                    let this = Lanes::splat(simd, $of as f32);
+                    nearest[0] = squares[0].simd_lt(best[0]).select(this, nearest[0]);
+                    nearest[1] = squares[N - 1].simd_lt(best[N - 1]).select(this, nearest[1]);
+                    for k in 0..N {
+                        best[k] = best[k].min(squares[k]);
+                    }
+                }
+            };
+        }
+        // Good distances from the start spare the look at most of the others.
+        look_at!(of_first);
+        if of_last != of_first {
+            look_at!(of_last);
+        }
         let mut bounds = best;
-        let guess = *self.guess;
-        // A good distance from the start spares the look at most of the others.
-        let mut least = f32::INFINITY;
-        if let Some(cluster) = clusters.get(guess as usize) {
-            let squares = cluster.distances_squared::<S, N>(simd, first);
-            for k in 0..N {
-                best[k] = best[k].min(squares[k]);
-                let bound = best[k].reduce_min();
-                bounds[k] = Lanes::splat(simd, bound);
-                least = bound;
-            }
+        for k in 0..N {
+            bounds[k] = Lanes::splat(simd, best[k].reduce_min());
         }
         for group in &self.candidates.groups {
             let boxes = group.distances_squared::<S, N>(simd, first);
@@ -406,24 +423,20 @@ impl<const N: usize> Query<'_, N> {
                 let lane = near.trailing_zeros() as usize;
                 near &= near - 1;
                 let of = group.cluster[lane % WIDTH];
-                if of == guess {
-                    continue;
-                }
-                let Some(cluster) = clusters.get(of as usize) else { continue };
-                let squares = cluster.distances_squared::<S, N>(simd, first);
-                for k in 0..N {
-                    best[k] = best[k].min(squares[k]);
-                }
-                let last = squares[N - 1].reduce_min();
-                if last < least {
-                    least = last;
-                    *self.guess = of;
+                if of != of_first && of != of_last {
+                    look_at!(of);
                 }
             }
         }
         let mut result = [0.0; N];
         for k in 0..N {
             result[k] = best[k].reduce_min();
+        }
+        for (k, (guess, nearest)) in [0, N - 1].into_iter().zip(self.guesses.iter_mut().zip(nearest)) {
+            let lane = best[k].simd_le(Lanes::splat(simd, result[k])).to_bitmask().trailing_zeros();
+            let mut of = [0.0; WIDTH];
+            nearest.store_slice(&mut of);
+            *guess = of[lane as usize % WIDTH] as u32;
         }
         result
     }
@@ -494,16 +507,15 @@ mod tests {
         };
         for i in 0..100 {
             let voxel = (point(7919 * i, 16.0)).round();
-            let mut out = [[0.0; 4]; 16];
+            let mut squared = [[1e6; 4]; 16];
             dispatch(Query {
                 candidates: &clusters.boxes,
                 clusters: &clusters,
                 first: voxel,
-                limit_squared: 1e6,
-                guess: &mut 0,
-                out: &mut out,
+                guesses: &mut [0; 2],
+                squared: &mut squared,
             });
-            for (row, squares) in out.iter().enumerate() {
+            for (row, squares) in squared.iter().enumerate() {
                 for (z, squared) in squares.iter().enumerate() {
                     let p = voxel.as_dvec3() + DVec3::new((row / 4) as f64, (row % 4) as f64, z as f64);
                     let truth = distance(p);

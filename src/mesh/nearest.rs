@@ -53,6 +53,12 @@ impl Band {
         (self.offset.abs() + self.half_width) as f32
     }
 
+    /// The same on one side of the surface.
+    fn limit(&self, inside: bool) -> f32 {
+        let outwards = if inside { -self.offset } else { self.offset };
+        (self.half_width + outwards).max(0.0) as f32
+    }
+
     /// Where a block lies whose distances are between `lo` and `hi`.
     fn side(&self, lo: f32, hi: f32) -> Side {
         let slack = f64::from(SLACK);
@@ -273,7 +279,7 @@ impl Search<'_> {
             }
         }
         clusters.finish();
-        let block = Block { origin: IVec3::ZERO, edge: TILE, nearest: 0 };
+        let block = Block { origin: IVec3::ZERO, edge: TILE, nearest: [0; 2] };
         self.halves(first, block, clusters, &clusters.boxes, lists, leaves);
     }
 
@@ -314,7 +320,7 @@ impl Search<'_> {
         }
     }
 
-    /// Where a block lies, and its nearest cluster; if it is near, `list` gets those of its candidates that can be nearest to a voxel of it.
+    /// Where a block lies, and its nearest cluster twice; if it is near, `list` gets those of its candidates that can be nearest to a voxel of it.
     fn enter(
         &self,
         tile: IVec3,
@@ -322,23 +328,16 @@ impl Search<'_> {
         clusters: &Clusters,
         from: &Candidates,
         list: &mut Candidates,
-    ) -> (Side, u32) {
+    ) -> (Side, [u32; 2]) {
         let centre = block.origin.as_vec3() + (block.edge - 1) as f32 / 2.0;
         // Half the diagonal of its voxels, and what covers the rounding.
         let radius = (block.edge - 1) as f32 / 2.0 * 3f32.sqrt() + SLACK;
         let limit = self.band.reach() + radius;
         let mut nearest = block.nearest;
-        let mut out = [[0.0]];
-        dispatch(Query {
-            candidates: from,
-            clusters,
-            first: centre,
-            limit_squared: limit * limit,
-            guess: &mut nearest,
-            out: &mut out,
-        });
+        let mut squared = [[limit * limit]];
+        dispatch(Query { candidates: from, clusters, first: centre, guesses: &mut nearest, squared: &mut squared });
         // At the limit nothing was found, and no voxel of the block is within reach.
-        let distance = if out[0][0] < limit * limit { out[0][0].sqrt() } else { f32::INFINITY };
+        let distance = if squared[0][0] < limit * limit { squared[0][0].sqrt() } else { f32::INFINITY };
         let (lo, hi) = (distance - radius, distance + radius);
         let side = if lo <= 0.0 {
             self.band.side(-hi, hi)
@@ -367,7 +366,7 @@ impl Search<'_> {
         active: &mut LeafMask,
     ) {
         let Band { offset, voxel_size, background, .. } = self.band;
-        let reach = self.band.reach();
+        let [limit_outside, limit_inside] = [false, true].map(|inside| self.band.limit(inside));
         let origin = tile + block.origin;
         let id = self.field.find(origin);
         let (field, was) = (&self.field.values(id).0, self.field.mask(id));
@@ -385,26 +384,36 @@ impl Search<'_> {
             }
             let (side, mut nearest) = self.enter(tile, half, clusters, from, list);
             let mut squared = [[f32::INFINITY; BLOCK as usize]; (BLOCK * BLOCK) as usize];
+            let first = half.origin - block.origin;
+            let start_of = |row: usize| (first.x * 64 + first.y * 8 + first.z) as usize + row / 4 * 64 + row % 4 * 8;
             if side == Side::Near {
+                for (row, squared) in squared.iter_mut().enumerate() {
+                    for (value, squared) in field[start_of(row)..].iter().zip(squared) {
+                        let limit = if *value < self.iso { limit_inside } else { limit_outside };
+                        *squared = limit * limit;
+                    }
+                }
                 dispatch(Query {
                     candidates: list,
                     clusters,
                     first: half.origin.as_vec3(),
-                    limit_squared: reach * reach,
-                    guess: &mut nearest,
-                    out: &mut squared,
+                    guesses: &mut nearest,
+                    squared: &mut squared,
                 });
             }
-            let first = half.origin - block.origin;
             for (row, squared) in squared.iter().enumerate() {
-                let start = (first.x * 64 + first.y * 8 + first.z) as usize + row / 4 * 64 + row % 4 * 8;
+                let start = start_of(row);
                 for (at, squared) in (start..LEAF_VOXELS).zip(squared) {
                     let distance = squared.sqrt();
                     let unsigned = f64::from(distance);
-                    let signed = if field[at] < self.iso { -unsigned - offset } else { unsigned - offset };
+                    let (signed, limit) = if field[at] < self.iso {
+                        (-unsigned - offset, limit_inside)
+                    } else {
+                        (unsigned - offset, limit_outside)
+                    };
                     let phi = (signed * voxel_size) as f32;
-                    // What lies beyond the reach is farther than the band.
-                    let known = distance < reach;
+                    // What lies beyond the limit is farther than the band.
+                    let known = distance < limit;
                     let (near, phi) = match side {
                         Side::Near => (known && phi.abs() < background, phi),
                         Side::Inside => (false, -background),
@@ -428,8 +437,8 @@ struct Block {
     /// Relative to the tile.
     origin: IVec3,
     edge: i32,
-    /// A cluster near it.
-    nearest: u32,
+    /// Clusters near it.
+    nearest: [u32; 2],
 }
 
 impl Block {
