@@ -389,7 +389,7 @@ impl<const N: usize> Query<'_, N> {
         for k in 0..N {
             best[k] = Lanes::splat(simd, limits[k]);
         }
-        // By lane, what is nearest to the first and to the last voxel.
+        // By lane, what is nearest to the first and to the last voxel. As f32, which names the first 2²⁴ exactly: more than a tile has, and guesses need not hold.
         let mut nearest = [Lanes::splat(simd, of_first as f32), Lanes::splat(simd, of_last as f32)];
         macro_rules! look_at {
             ($of:expr) => {
