@@ -4,8 +4,8 @@
 //! erode, then dilate: what is thinner than twice the distance goes; `close` is dilate, then erode: gaps narrower than
 //! twice the distance are filled. Between the two the distance is rebuilt, or the second would undo the first.
 //!
-//! Each step is one rebuild ([`crate::mesh::rebuild`]): exact distances to the polygonised surface and its sharp edges, at any distance,
-//! no stepping; `offset --like openvdb` takes steps, to compare. Eroding everything away leaves an empty level set, which is legal.
+//! Each step is one rebuild ([`crate::mesh::rebuild`]): exact distances to the polygonised surface, at any distance, and to
+//! its sharp edges, up to 64 voxels; no stepping; `offset --like openvdb` takes steps, to compare. Eroding everything away leaves an empty level set, which is legal.
 //!
 //! An opening never adds and a closing never removes, φ_open ≥ φ ≥ φ_close: what the errors of the two steps would move to the other side stays as it was. A second
 //! one should change nothing. It changes a box, a turned box and a lens by less than 0.1 voxel, but single voxels of scanned models by up to 0.9
@@ -244,7 +244,7 @@ mod tests {
 
     #[test]
     fn edges_are_rounded_without_ripples() {
-        // Dilated, a box gets round edges and corners; eroded, what is left of the space around it would.
+        // A box gets round edges and corners when it is dilated, and when the space around it is eroded: one outwards, one inwards.
         let run = RunOptions::default();
         let turn = glam::DMat3::from_axis_angle(DVec3::new(0.3, 0.5, 0.8).normalize(), 0.4);
         let (half, w) = (DVec3::new(14.3, 12.7, 13.1), 5.0);
