@@ -16,7 +16,8 @@ const SLAB_LINES: usize = LINES / 8;
 
 /// The memory of a step on a leaf yet to come, asked for line by line.
 pub struct Ahead<'a> {
-    written: &'a LeafValues,
+    /// The leaf that is written, unless that goes past the cache.
+    written: Option<&'a LeafValues>,
     /// The leaf and its neighbours below and above in x, y and z.
     read: [&'a LeafValues; 7],
     reach: usize,
@@ -25,9 +26,15 @@ pub struct Ahead<'a> {
 }
 
 impl<'a> Ahead<'a> {
-    /// For a stencil that reaches `reach` voxels along the axes, 0 to 8, on the leaf in the middle of `around`; the result goes to `written`.
+    /// For a stencil that reaches `reach` voxels along the axes, 0 to 8, on the leaf in the middle of `around`; the result goes to `written`,
+    /// if it goes through the cache.
     #[inline(always)]
-    pub fn new(values: &'a Paged<LeafValues>, around: &Neighbours, reach: usize, written: &'a LeafValues) -> Self {
+    pub fn new(
+        values: &'a Paged<LeafValues>,
+        around: &Neighbours,
+        reach: usize,
+        written: Option<&'a LeafValues>,
+    ) -> Self {
         // Not by `map`, which would not be inlined.
         let mut read = [values.get(around[13]); 7];
         for (leaf, q) in read.iter_mut().zip([13, 4, 22, 10, 16, 12, 14]) {
@@ -44,7 +51,9 @@ impl<'a> Ahead<'a> {
         }
         let (at, slab, in_slab) = (self.line * LINE, self.line / SLAB_LINES, self.line % SLAB_LINES);
         self.line += 1;
-        prefetch::<true>(&self.written.0[at]);
+        if let Some(leaf) = self.written {
+            prefetch::<true>(&leaf.0[at]);
+        }
         // A line is two rows of a slab. Of the neighbours in z every row is read.
         let (reach, rim) = (self.reach, self.reach.div_ceil(2));
         let wanted =

@@ -7,6 +7,7 @@ use fearless_simd::{Select, Simd, SimdBase, SimdMask, mask32x16};
 use super::domain::Domain;
 use super::tracker::Tracker;
 use crate::grid::{Ahead, Grid, LeafId, LeafMask, LeafValues, PageLeaves, Paged};
+use crate::stencil::Results;
 use crate::stencil::simd::{self, Lanes, Work, with_sign};
 
 /// One explicit Euler step on a leaf.
@@ -121,6 +122,7 @@ impl Tracker<'_> {
             // The old values are read from the pages that are written.
             out.own_pages(domain.leaves());
         }
+        let (written, overwrites) = (domain.leaves().len(), blend.old == 0.0 || old.is_some());
         let step = |leaves, new_page, page: &mut [LeafValues], masks: Option<&mut [LeafMask]>| {
             let mut emptied = Vec::new();
             // One check a page of 64 leaves: a cancelled run stops within a fraction of a step.
@@ -136,6 +138,7 @@ impl Tracker<'_> {
                     leaves,
                     new_page,
                     page,
+                    results: Results::new(written, overwrites),
                     masks,
                     several_buffers,
                     emptied,
@@ -169,6 +172,8 @@ struct PageStep<'a, K> {
     /// Whether the page holds anything but the values that a step into it relies on.
     new_page: bool,
     page: &'a mut [LeafValues],
+    /// How the page is written.
+    results: Results,
     /// The masks of the page, if the step trims.
     masks: Option<&'a mut [LeafMask]>,
     /// Whether other buffers than φ and this one are to be kept in step.
@@ -198,6 +203,7 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
                         #[inline(always)]
                         |next| {
                             let written = &self.page[PageLeaves::slot(next)];
+                            let written = (!self.results.past_cache()).then_some(written);
                             Ahead::new(self.grid.value_pages(), &neighbours[next.index()], K::REACH, written)
                         },
                     );
@@ -245,7 +251,7 @@ impl<K: LeafKernel> Work for PageStep<'_, K> {
                         }
                         // The other voxels of the rows take φ's value: so trimmed ones need no care of their own.
                         let mask = mask32x16::from_bitmask(simd, u64::from(bits));
-                        mask.select(value, now).store_slice(&mut out.0[at..at + 16]);
+                        self.results.write(simd, out, x, y, mask.select(value, now));
                     },
                 );
                 if emptied != 0 || mask.is_some_and(|mask| mask.is_empty()) {

@@ -11,9 +11,11 @@ pub mod eikonal;
 pub mod filter;
 mod halo;
 pub mod normals;
+mod results;
 pub mod simd;
 pub mod upwind;
 
 pub use cube::{Cube, WIDEST_RIM};
 pub use filter::{MedianScratch, SlabScratch, box_mean, box_median};
 pub use halo::{FaceHalo, Halo, LeafHalo, Row, StarHalo};
+pub(crate) use results::Results;
