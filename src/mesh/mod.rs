@@ -3,12 +3,14 @@
 mod attributes;
 mod bezier;
 mod bins;
+mod block;
 mod bvh;
 mod closest;
 mod cluster;
 pub mod files;
 mod findings;
 mod from_levelset;
+mod gather;
 mod nearest;
 mod nurbs;
 mod prepare;
@@ -70,8 +72,11 @@ pub struct TriangleMesh {
 
 impl TriangleMesh {
     /// The corners of triangle `t`.
+    #[inline]
     pub fn corners(&self, t: usize) -> [DVec3; 3] {
-        self.triangles[t].map(|v| self.positions[v as usize])
+        // Not by `map`, which would not be inlined.
+        let [a, b, c] = self.triangles[t];
+        [self.positions[a as usize], self.positions[b as usize], self.positions[c as usize]]
     }
 
     /// Adds another mesh. Attributes that only one of the two has are dropped.

@@ -1,9 +1,8 @@
 //! Exact signed distances to the surface of a field, in the band around the surface at an offset.
 //!
 //! Space is gone through in tiles of 32³ voxels, each one task. A tile collects the triangles near it in clusters of
-//! sixteen and is halved down to blocks of 4³ voxels. Each block gets the clusters that can be nearest to any of its voxels:
-//! if the centre of a block of radius r has the distance D, a voxel v of it has at most D + r, so a cluster nearest to v is at
-//! most D + 2r from the centre, by its box. In the same way D − r ≤ |φ| ≤ D + r tells the blocks without any voxel of the band, which are left.
+//! sixteen and is halved down to blocks of 4³ voxels. Each [block](super::block) gets the clusters that can be nearest to any of its voxels.
+//! If its centre has the distance D and its radius is r, D − r ≤ |φ| ≤ D + r tells the blocks without any voxel of the band, which are left.
 //! In the last blocks each voxel looks at the clusters whose box is nearer than the nearest triangle found so far. So every
 //! distance is that of the nearest triangle, whatever the field is; no property of φ but its sign is used.
 //!
@@ -16,19 +15,13 @@ use glam::IVec3;
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::cluster::{Candidates, Clusters, Nearby, Query, SLACK};
+use super::block::{BLOCK, Block, Lists, TILE};
+use super::cluster::{Candidates, Clusters, SLACK};
 use crate::error::Result;
 use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset};
 use crate::levelset::BYTES_A_LEAF;
 use crate::levelset::isosurface::{IsoSurface, SHARP_TRIANGLES};
 use crate::run::RunOptions;
-use crate::stencil::simd::dispatch;
-
-/// Voxels along the edge of a tile: its clusters fit the second-level cache, and those of its neighbours that it needs as well are
-/// as many as half its own.
-pub(crate) const TILE: i32 = 32;
-/// Voxels along the edge of the blocks whose voxels are computed one by one.
-const BLOCK: i32 = 4;
 
 /// Where distances are wanted, in voxels: where the distance from the surface, less `offset`, is within the half width.
 #[derive(Clone, Copy, Debug)]
@@ -193,8 +186,7 @@ struct Scratch {
     /// Square of the distance up to which triangles can be nearest to a voxel of it.
     farthest: i32,
     clusters: Clusters,
-    /// The candidates of the current block at each level below the tile.
-    lists: [Candidates; 3],
+    lists: Lists,
 }
 
 struct Search<'a> {
@@ -279,8 +271,7 @@ impl Search<'_> {
             }
         }
         clusters.finish();
-        let block = Block { origin: IVec3::ZERO, edge: TILE, nearest: [0; 2] };
-        self.halves(first, block, clusters, &clusters.boxes, lists, leaves);
+        self.halves(first, Block::WHOLE, clusters, &clusters.boxes, lists, leaves);
     }
 
     /// Goes down into the eight halves of a block, whose candidates are `from`.
@@ -294,14 +285,12 @@ impl Search<'_> {
         leaves: &mut Vec<Leaf>,
     ) {
         let Some((list, lists)) = lists.split_first_mut() else { return };
-        for half in block.halves() {
+        for mut half in block.halves() {
             let first = tile + half.origin;
             if half.edge >= LEAF_DIM && !(self.wanted)(first, first + (half.edge - 1)) {
                 continue;
             }
-            let (side, nearest) = self.enter(tile, half, clusters, from, list);
-            let half = Block { nearest, ..half };
-            if side != Side::Near {
+            if self.enter(tile, &mut half, clusters, from, list) != Side::Near {
                 continue;
             }
             if half.edge == LEAF_DIM {
@@ -320,24 +309,17 @@ impl Search<'_> {
         }
     }
 
-    /// Where a block lies, and its nearest cluster twice; if it is near, `list` gets those of its candidates that can be nearest to a voxel of it.
+    /// Where a block lies; if it is near, `list` gets those of its candidates that can be nearest to a voxel of it.
     fn enter(
         &self,
         tile: IVec3,
-        block: Block,
+        block: &mut Block,
         clusters: &Clusters,
         from: &Candidates,
         list: &mut Candidates,
-    ) -> (Side, [u32; 2]) {
-        let centre = block.origin.as_vec3() + (block.edge - 1) as f32 / 2.0;
-        // Half the diagonal of its voxels, and what covers the rounding.
-        let radius = (block.edge - 1) as f32 / 2.0 * 3f32.sqrt() + SLACK;
-        let limit = self.band.reach() + radius;
-        let mut nearest = block.nearest;
-        let mut squared = [[limit * limit]];
-        dispatch(Query { candidates: from, clusters, first: centre, guesses: &mut nearest, squared: &mut squared });
-        // At the limit nothing was found, and no voxel of the block is within reach.
-        let distance = if squared[0][0] < limit * limit { squared[0][0].sqrt() } else { f32::INFINITY };
+    ) -> Side {
+        let reach = self.band.reach();
+        let (distance, radius) = (block.distance(clusters, from, reach), block.radius());
         let (lo, hi) = (distance - radius, distance + radius);
         let side = if lo <= 0.0 {
             self.band.side(-hi, hi)
@@ -348,9 +330,9 @@ impl Search<'_> {
             self.band.side(lo, hi)
         };
         if side == Side::Near {
-            dispatch(Nearby { from, to: list, centre, reach: limit.min(distance + 2.0 * radius) });
+            block.narrow(distance, reach, from, list);
         }
-        (side, nearest)
+        side
     }
 
     /// Fills the leaf at a block.
@@ -370,7 +352,7 @@ impl Search<'_> {
         let origin = tile + block.origin;
         let id = self.field.find(origin);
         let (field, was) = (&self.field.values(id).0, self.field.mask(id));
-        for half in block.halves() {
+        for mut half in block.halves() {
             let first = tile + half.origin;
             if self.band.keeps && !(self.wanted)(first, first + (half.edge - 1)) {
                 let first = half.origin - block.origin;
@@ -382,7 +364,7 @@ impl Search<'_> {
                 }
                 continue;
             }
-            let (side, mut nearest) = self.enter(tile, half, clusters, from, list);
+            let side = self.enter(tile, &mut half, clusters, from, list);
             let mut squared = [[f32::INFINITY; BLOCK as usize]; (BLOCK * BLOCK) as usize];
             let first = half.origin - block.origin;
             let start_of = |row: usize| (first.x * 64 + first.y * 8 + first.z) as usize + row / 4 * 64 + row % 4 * 8;
@@ -393,13 +375,7 @@ impl Search<'_> {
                         *squared = limit * limit;
                     }
                 }
-                dispatch(Query {
-                    candidates: list,
-                    clusters,
-                    first: half.origin.as_vec3(),
-                    guesses: &mut nearest,
-                    squared: &mut squared,
-                });
+                half.look_up(clusters, list, &mut squared);
             }
             for (row, squared) in squared.iter().enumerate() {
                 let start = start_of(row);
@@ -428,22 +404,5 @@ impl Search<'_> {
 
     fn inside(&self, ijk: IVec3) -> bool {
         self.field.voxel(ijk).0 < self.iso
-    }
-}
-
-/// A cube of voxels of a tile.
-#[derive(Clone, Copy)]
-struct Block {
-    /// Relative to the tile.
-    origin: IVec3,
-    edge: i32,
-    /// Clusters near it.
-    nearest: [u32; 2],
-}
-
-impl Block {
-    fn halves(self) -> impl Iterator<Item = Self> {
-        let edge = self.edge / 2;
-        (0..8).map(move |c| Self { origin: self.origin + IVec3::new(c >> 2, c >> 1 & 1, c & 1) * edge, edge, ..self })
     }
 }

@@ -11,23 +11,24 @@
 //! The error is below 4e-6 voxels. A triangle too thin to have a normal is its longest edge.
 //!
 //! Sixteen voxels are computed at once: eight along z in two rows. Rows start where the triangle's reach does and not at leaves,
-//! so that a triangle of a voxel's size takes about 25 vectors.
+//! so that a triangle of a voxel's size takes about 25 vectors. Where triangles are smaller, voxels look theirs up instead
+//! ([`gather`](super::gather)).
 
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask, f32x8};
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 
 use super::bins::{Bins, ceil, floor};
+use super::block::TILE;
+use super::gather::Gather;
 use crate::error::Result;
 use crate::grid::{LEAF_DIM, LEAF_VOXELS, LeafValues};
 use crate::mesh::closest::closest_on_triangle;
 use crate::run::RunOptions;
 use crate::stencil::simd::{Lanes, Work, dispatch};
 
-/// Leaves along a tile's edge: a tile's 128 KiB of values stay in the second-level cache while its triangles pass.
-const TILE_LEAVES: i32 = 4;
-/// Voxels along a tile's edge.
-const TILE: i32 = LEAF_DIM * TILE_LEAVES;
+/// Leaves along the edge of a tile, whose 128 KiB of values stay in the second-level cache while its triangles pass.
+const TILE_LEAVES: i32 = TILE / LEAF_DIM;
 /// Distance in the tile's values from a row to the next along x and y.
 const ROW: [usize; 2] = [(TILE * TILE) as usize, TILE as usize];
 /// Longest edge of a block of voxels that one frame serves.
@@ -80,20 +81,23 @@ pub(crate) fn leaves_near_triangles<R: Send>(
     let per_tile: Vec<Vec<R>> = (0..bins.len())
         .into_par_iter()
         .map_init(
-            || vec![0.0; ROW[0] * TILE as usize],
-            |values, bin| {
+            || (vec![0.0; ROW[0] * TILE as usize], Gather::default(), Vec::new()),
+            |(values, gather, rest), bin| {
                 if run.is_cancelled() {
                     return Vec::new();
                 }
                 let origin = IVec3::from_array(*bins.key(bin)) * TILE;
                 let mut touched = 0;
                 values.fill(half_width * half_width);
-                let triangles = bins.items(bin);
+                gather.take(origin, bins.items(bin), &triangle, half_width, rest);
+                gather.lower(origin, &triangle, half_width, values, |voxel| {
+                    touched |= leaf_bits(voxel >> 3, voxel >> 3);
+                });
                 dispatch(LowerTile {
                     values,
                     touched: &mut touched,
                     origin,
-                    triangles,
+                    triangles: rest,
                     triangle: &triangle,
                     half_width,
                 });

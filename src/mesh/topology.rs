@@ -54,19 +54,18 @@ fn sort_by_vertex<T: Copy + Ord + Send, I: Iterator<Item = T>>(
 ) -> Vec<T> {
     let vertices = triangles.iter().flatten().max().map_or(0, |&v| v as usize + 1);
     let mut next = vec![0usize; vertices + 1];
-    for item in (0..triangles.len()).flat_map(&items) {
-        next[vertex(&item) as usize + 1] += 1;
-    }
+    // `for_each`, since the loop of a nested iterator asks after each item whether the inner one has ended.
+    (0..triangles.len()).flat_map(&items).for_each(|item| next[vertex(&item) as usize + 1] += 1);
     for v in 0..vertices {
         next[v + 1] += next[v];
     }
     let Some(any) = (0..triangles.len()).flat_map(&items).next() else { return Vec::new() };
     let mut sorted = vec![any; next[vertices]];
-    for item in (0..triangles.len()).flat_map(&items) {
+    (0..triangles.len()).flat_map(&items).for_each(|item| {
         let at = &mut next[vertex(&item) as usize];
         sorted[*at] = item;
         *at += 1;
-    }
+    });
     sorted.par_chunk_by_mut(|a, b| vertex(a) == vertex(b)).for_each(<[T]>::sort_unstable);
     sorted
 }
@@ -141,34 +140,91 @@ pub fn analyze(mesh: &TriangleMesh) -> Topology {
 
 /// [`analyze`], given the mesh's edge uses.
 pub(crate) fn analyze_edges(mesh: &TriangleMesh, uses: &[EdgeUse]) -> Topology {
-    let mut topology = Topology { signed_volume: signed_volume(mesh), ..Topology::default() };
-    let mut sets = DisjointSets::new(mesh.triangles.len());
-    let mut edges = 0;
-    for edge in by_edge(uses) {
-        edges += 1;
-        match edge {
-            [_] => topology.boundary_edges += 1,
-            [a, b] => topology.misoriented_edges += usize::from(a.forward == b.forward),
-            _ => topology.non_manifold_edges += 1,
+    let (of_edges, of_triangles) = rayon::join(|| EdgeCounts::new(mesh, uses), || TriangleCounts::new(mesh));
+    let EdgeCounts { edges, boundary, misoriented, non_manifold, parts, twins } = of_edges;
+    let TriangleCounts { degenerate, used, signed_volume } = of_triangles;
+    // A triangle of one vertex has no edge that would show its twin.
+    let duplicates = if twins || degenerate > 0 {
+        sorted_triangles(&mesh.triangles).windows(2).filter(|w| w[0].0 == w[1].0).count()
+    } else {
+        0
+    };
+    Topology {
+        boundary_edges: boundary,
+        non_manifold_edges: non_manifold,
+        misoriented_edges: misoriented,
+        duplicate_triangles: duplicates,
+        degenerate_triangles: degenerate,
+        unreferenced_vertices: mesh.positions.len() - used,
+        parts,
+        closed: !mesh.triangles.is_empty() && boundary + non_manifold + misoriented == 0,
+        euler_characteristic: used as i64 - edges as i64 + mesh.triangles.len() as i64,
+        signed_volume,
+    }
+}
+
+/// What the edges tell.
+#[derive(Default)]
+struct EdgeCounts {
+    edges: usize,
+    boundary: usize,
+    misoriented: usize,
+    non_manifold: usize,
+    parts: usize,
+    /// Whether an edge has two triangles with the same third vertex.
+    twins: bool,
+}
+
+impl EdgeCounts {
+    fn new(mesh: &TriangleMesh, uses: &[EdgeUse]) -> Self {
+        let mut counts = Self::default();
+        let mut sets = DisjointSets::new(mesh.triangles.len());
+        let third = |u: &EdgeUse| {
+            let ([a, b, c], [from, to]) = (mesh.triangles[u.triangle as usize], u.vertices());
+            a ^ b ^ c ^ from ^ to
+        };
+        for edge in by_edge(uses) {
+            counts.edges += 1;
+            match edge {
+                [_] => counts.boundary += 1,
+                [a, b] => {
+                    counts.misoriented += usize::from(a.forward == b.forward);
+                    counts.twins |= third(a) == third(b);
+                }
+                _ => {
+                    counts.non_manifold += 1;
+                    let mut thirds: Vec<u32> = edge.iter().map(third).collect();
+                    thirds.sort_unstable();
+                    counts.twins |= thirds.windows(2).any(|pair| pair[0] == pair[1]);
+                }
+            }
+            for pair in edge.windows(2) {
+                sets.join(pair[0].triangle, pair[1].triangle);
+            }
         }
-        for pair in edge.windows(2) {
-            sets.join(pair[0].triangle, pair[1].triangle);
+        counts.parts = (0..mesh.triangles.len() as u32).filter(|&t| sets.root(t) == t).count();
+        counts
+    }
+}
+
+/// What the triangles tell one by one.
+struct TriangleCounts {
+    degenerate: usize,
+    /// Vertices in use.
+    used: usize,
+    signed_volume: f64,
+}
+
+impl TriangleCounts {
+    fn new(mesh: &TriangleMesh) -> Self {
+        let mut used = vec![false; mesh.positions.len()];
+        mesh.triangles.iter().flatten().for_each(|&v| used[v as usize] = true);
+        Self {
+            degenerate: (0..mesh.triangles.len()).filter(|&t| is_degenerate(mesh, t)).count(),
+            used: used.iter().filter(|&&u| u).count(),
+            signed_volume: signed_volume(mesh),
         }
     }
-    topology.parts = (0..mesh.triangles.len() as u32).filter(|&t| sets.root(t) == t).count();
-    topology.closed = !mesh.triangles.is_empty()
-        && topology.boundary_edges + topology.non_manifold_edges + topology.misoriented_edges == 0;
-
-    let mut used = vec![false; mesh.positions.len()];
-    mesh.triangles.iter().flatten().for_each(|&v| used[v as usize] = true);
-    let used = used.iter().filter(|&&u| u).count();
-    topology.unreferenced_vertices = mesh.positions.len() - used;
-    topology.euler_characteristic = used as i64 - edges + mesh.triangles.len() as i64;
-
-    let keys = sorted_triangles(&mesh.triangles);
-    topology.duplicate_triangles = keys.windows(2).filter(|w| w[0].0 == w[1].0).count();
-    topology.degenerate_triangles = (0..mesh.triangles.len()).filter(|&t| is_degenerate(mesh, t)).count();
-    topology
 }
 
 /// The vertices of a triangle in ascending order: equal for duplicates, whatever their winding.

@@ -19,6 +19,9 @@ const TILE: i32 = 32;
 /// coincident triangles either way.
 const COINCIDENT: f64 = 1e-6;
 
+/// More than the rounding of a column at the largest coordinates, in voxels.
+const ROUNDING: f64 = 1e-6;
+
 /// A change of the winding number in a row.
 #[derive(Clone, Copy, Debug)]
 struct Crossing {
@@ -46,7 +49,11 @@ impl Crossings {
     pub fn new(count: usize, triangle: impl Fn(usize) -> [DVec3; 3] + Sync) -> Self {
         let bins = Bins::new(count, |t, tiles: &mut Vec<[i32; 2]>| {
             let [a, b, c] = triangle(t);
-            let (lo, hi) = (ceil(a.min(b).min(c)), floor(a.max(b).max(c)));
+            // Columns are found with rounding, rows without. Most triangles smaller than a voxel have none.
+            let (lo, hi) = (ceil(a.min(b).min(c) - ROUNDING), floor(a.max(b).max(c) + ROUNDING));
+            if lo.x > hi.x || lo.y > hi.y {
+                return;
+            }
             for x in lo.x.div_euclid(TILE)..=hi.x.div_euclid(TILE) {
                 tiles.extend((lo.y.div_euclid(TILE)..=hi.y.div_euclid(TILE)).map(|y| [x, y]));
             }

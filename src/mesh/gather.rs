@@ -1,0 +1,160 @@
+//! Exact unsigned distances of a tile's voxels from many small triangles: each voxel looks its nearest one up among clusters of
+//! sixteen, where each triangle would else lower all voxels around it.
+//!
+//! Which way is cheaper depends on how many triangles there are in the band's part of a voxel: one that is smaller than a voxel lowers as many
+//! voxels as one of a voxel's size, while a voxel looks at a few clusters, however small their triangles are.
+
+use glam::{DVec3, IVec3};
+
+use super::bins::floor;
+use super::block::{BLOCK, Block, Lists, TILE};
+use super::cluster::{Candidates, Clusters};
+
+/// Largest extent of a triangle along an axis, in voxels: the error of its f32 arithmetic grows with its size.
+const LARGEST: f64 = 4.0;
+/// A triangle lower than this, in voxels, may be too thin for a cluster.
+const THINNEST: f64 = 1e-4;
+/// The widest band, in voxels: triangles around a tile are few beside its own up to here.
+const WIDEST: f32 = 16.0;
+
+/// What it costs to lower a vector of 16 voxels by a triangle, its share of the set-up included; to look a voxel up; to put a triangle into a
+/// cluster. Nanoseconds on one machine, of which only ratios count.
+const LOWERED: f64 = 27.0;
+const LOOKED_UP: f64 = 120.0;
+const GATHERED: f64 = 60.0;
+
+/// Buffers for one tile after the other.
+#[derive(Default)]
+pub(super) struct Gather {
+    /// The triangles that are looked up, with their places along a curve on which neighbours are near to each other.
+    order: Vec<(u32, u32)>,
+    clusters: Clusters,
+    lists: Lists,
+}
+
+impl Gather {
+    /// Takes those of a tile's triangles that are better looked up. The others are put into `rest`, all of them if it is not worth it.
+    pub fn take(
+        &mut self,
+        tile: IVec3,
+        triangles: &[u32],
+        triangle: &impl Fn(usize) -> [DVec3; 3],
+        half_width: f32,
+        rest: &mut Vec<u32>,
+    ) {
+        self.order.clear();
+        rest.clear();
+        let mut twice_area = 0.0;
+        if half_width <= WIDEST {
+            let tile = tile.as_dvec3();
+            for &t in triangles {
+                let [a, b, c] = triangle(t as usize);
+                let (lo, hi) = (a.min(b).min(c), a.max(b).max(c));
+                let extent = (hi - lo).max_element();
+                let twice = (b - a).cross(c - a).length();
+                // No side is longer than √3 extents.
+                if extent <= LARGEST && twice > THINNEST * 3f64.sqrt() * extent {
+                    self.order.push((place((a + b + c) / 3.0 - tile), t));
+                    twice_area += twice;
+                } else {
+                    rest.push(t);
+                }
+            }
+        }
+        let (count, width) = (self.order.len() as f64, f64::from(2.0 * half_width));
+        let vectors = (width + (twice_area / count.max(1.0)).sqrt()).powi(3) / 16.0;
+        let voxels = 0.5 * twice_area * width;
+        if count * vectors * LOWERED <= voxels * LOOKED_UP + count * GATHERED {
+            self.order.clear();
+            rest.clear();
+            rest.extend_from_slice(triangles);
+        }
+    }
+
+    /// Lowers the squared distances of a tile by the triangles that were taken; `touch` is told the blocks that may be lowered.
+    pub fn lower(
+        &mut self,
+        tile: IVec3,
+        triangle: &impl Fn(usize) -> [DVec3; 3],
+        half_width: f32,
+        values: &mut [f32],
+        touch: impl FnMut(IVec3),
+    ) {
+        let Self { order, clusters, lists } = self;
+        if order.is_empty() {
+            return;
+        }
+        order.sort_unstable();
+        clusters.clear();
+        for &(_, t) in order.iter() {
+            let corners = triangle(t as usize);
+            let voxel = floor(corners[0]);
+            let origin = voxel.as_dvec3();
+            // By hand: a closure would not be inlined.
+            let [a, b, c] = corners;
+            let corners = [(a - origin).as_vec3(), (b - origin).as_vec3(), (c - origin).as_vec3()];
+            clusters.push((voxel - tile).as_vec3(), corners);
+        }
+        clusters.finish();
+        let mut tile = Tile { clusters, half_width, values, touch };
+        tile.halves(Block::WHOLE, &clusters.boxes, lists);
+    }
+}
+
+/// A tile whose voxels look up their distances.
+struct Tile<'a, F> {
+    clusters: &'a Clusters,
+    half_width: f32,
+    values: &'a mut [f32],
+    touch: F,
+}
+
+impl<F: FnMut(IVec3)> Tile<'_, F> {
+    /// Goes down into the eight halves of a block, whose candidates are `from`.
+    fn halves(&mut self, block: Block, from: &Candidates, lists: &mut [Candidates]) {
+        let Some((list, lists)) = lists.split_first_mut() else { return };
+        for mut half in block.halves() {
+            let distance = half.distance(self.clusters, from, self.half_width);
+            if distance - half.radius() >= self.half_width {
+                continue;
+            }
+            half.narrow(distance, self.half_width, from, list);
+            if half.edge == BLOCK {
+                self.fill(&half, list);
+            } else {
+                self.halves(half, list, lists);
+            }
+        }
+    }
+
+    fn fill(&mut self, block: &Block, candidates: &Candidates) {
+        let start_of = |row: usize| {
+            let at = block.origin + IVec3::new(row as i32 / BLOCK, row as i32 % BLOCK, 0);
+            ((at.x * TILE + at.y) * TILE + at.z) as usize
+        };
+        let mut squared = [[0.0; BLOCK as usize]; (BLOCK * BLOCK) as usize];
+        for (row, squared) in squared.iter_mut().enumerate() {
+            squared.copy_from_slice(&self.values[start_of(row)..][..BLOCK as usize]);
+        }
+        block.look_up(self.clusters, candidates, &mut squared);
+        for (row, squared) in squared.iter().enumerate() {
+            self.values[start_of(row)..][..BLOCK as usize].copy_from_slice(squared);
+        }
+        (self.touch)(block.origin);
+    }
+}
+
+/// The place of a position (voxels about the tile) along Morton's curve.
+fn place(position: DVec3) -> u32 {
+    const HALF: i32 = 512;
+    let cell = (floor(position) + HALF).clamp(IVec3::ZERO, IVec3::splat(2 * HALF - 1)).as_uvec3();
+    spread(cell.x) << 2 | spread(cell.y) << 1 | spread(cell.z)
+}
+
+/// The lowest ten bits, two zeros after each.
+fn spread(mut bits: u32) -> u32 {
+    bits = (bits | bits << 16) & 0x0300_00ff;
+    bits = (bits | bits << 8) & 0x0300_f00f;
+    bits = (bits | bits << 4) & 0x030c_30c3;
+    (bits | bits << 2) & 0x0924_9249
+}
