@@ -26,8 +26,8 @@ const GATHERED: f64 = 60.0;
 /// Buffers for one tile after the other.
 #[derive(Default)]
 pub(super) struct Gather {
-    /// The triangles that are looked up, with their places along a curve on which neighbours are near to each other.
-    order: Vec<(u32, u32)>,
+    /// The triangles that are looked up; above their numbers their places along a curve on which neighbours are near to each other.
+    order: Vec<u64>,
     clusters: Clusters,
     lists: Lists,
 }
@@ -54,7 +54,7 @@ impl Gather {
                 let twice = (b - a).cross(c - a).length();
                 // No side is longer than √3 extents.
                 if extent <= LARGEST && twice > THINNEST * 3f64.sqrt() * extent {
-                    self.order.push((place((a + b + c) / 3.0 - tile), t));
+                    self.order.push(u64::from(place((a + b + c) / 3.0 - tile)) << 32 | u64::from(t));
                     twice_area += twice;
                 } else {
                     rest.push(t);
@@ -86,8 +86,8 @@ impl Gather {
         }
         order.sort_unstable();
         clusters.clear();
-        for &(_, t) in order.iter() {
-            let corners = triangle(t as usize);
+        for &place_and_number in order.iter() {
+            let corners = triangle(place_and_number as u32 as usize);
             let voxel = floor(corners[0]);
             let origin = voxel.as_dvec3();
             // By hand: a closure would not be inlined.

@@ -51,6 +51,7 @@ pub use topology::{Topology, analyze};
 pub use winding::WindingNumber;
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 /// An indexed triangle mesh in world units.
 ///
@@ -101,11 +102,11 @@ impl TriangleMesh {
 
     /// Smallest box around the positions that triangles use; `None` without triangles.
     pub fn bounding_box(&self) -> Option<(DVec3, DVec3)> {
-        self.triangles
-            .iter()
-            .flatten()
-            .map(|&v| self.positions[v as usize])
-            .map(|p| (p, p))
-            .reduce(|(lo, hi), (p, _)| (lo.min(p), hi.max(p)))
+        let of_one = |t| {
+            let [a, b, c] = self.corners(t);
+            (a.min(b).min(c), a.max(b).max(c))
+        };
+        let both = |(lo, hi): (DVec3, DVec3), (a, b): (DVec3, DVec3)| (lo.min(a), hi.max(b));
+        (0..self.triangles.len()).into_par_iter().with_min_len(1024).map(of_one).reduce_with(both)
     }
 }

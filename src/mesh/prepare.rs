@@ -6,13 +6,15 @@
 //! goes into the [`MeshFindings`]. What cannot be repaired here, holes and intersections, is left to the winding number.
 
 use std::collections::VecDeque;
+use std::hash::BuildHasher;
 
 use glam::DVec3;
 use rayon::prelude::*;
-use rustc_hash::{FxHashMap, FxHashSet};
+use rustc_hash::{FxBuildHasher, FxHashMap, FxHashSet};
 
 use super::topology::{
-    DisjointSets, EdgeUse, analyze_edges, by_edge, edge_uses, is_degenerate, sorted_triangles, volume_about,
+    DisjointSets, EdgeUse, analyze_edges, by_edge, edge_uses, is_degenerate, signed_volume, sorted_triangles,
+    volume_about,
 };
 use super::winding::solid_angle;
 use super::{Bvh, MeshFindings, TriangleMesh, WindingNumber, analyze};
@@ -25,8 +27,8 @@ const CRACK_TOLERANCE: f64 = 2e-6;
 /// behind: they have no part in a level set.
 pub fn prepare(mesh: &TriangleMesh) -> (TriangleMesh, MeshFindings) {
     let mut findings = MeshFindings::default();
-    let mut clean =
-        TriangleMesh { positions: mesh.positions.clone(), triangles: mesh.triangles.clone(), ..Default::default() };
+    let (positions, triangles) = rayon::join(|| mesh.positions.clone(), || mesh.triangles.clone());
+    let mut clean = TriangleMesh { positions, triangles, ..Default::default() };
     findings.welded_equal = weld_equal(&mut clean);
     let mut uses = edge_uses(&clean.triangles);
     findings.found = analyze_edges(&clean, &uses);
@@ -43,9 +45,15 @@ pub fn prepare(mesh: &TriangleMesh) -> (TriangleMesh, MeshFindings) {
             uses = edge_uses(&clean.triangles);
         }
     }
-    let patches = Patches::new(&mut clean, &uses, &mut findings);
-    orient_outwards(&mut clean, &patches, &mut findings);
+    // `found` is of the mesh as it still is, if nothing was dropped or joined.
     let changes = findings.degenerate_dropped + findings.duplicates_dropped + findings.cancelled + findings.welded_near;
+    let patches = if changes == 0 && findings.found.closed && findings.found.parts == 1 {
+        Patches::one(clean.triangles.len())
+    } else {
+        Patches::new(&mut clean, &uses, &mut findings)
+    };
+    drop(uses);
+    orient_outwards(&mut clean, &patches, &mut findings);
     let turned = findings.inside_out || findings.reoriented + findings.flipped_parts > 0;
     findings.converted = if changes == 0 && !turned { findings.found.clone() } else { analyze(&clean) };
     findings.converted.unreferenced_vertices = 0;
@@ -54,20 +62,30 @@ pub fn prepare(mesh: &TriangleMesh) -> (TriangleMesh, MeshFindings) {
 
 /// Lets every triangle use the first of the vertices that have equal coordinates. Returns how many vertices were joined.
 fn weld_equal(mesh: &mut TriangleMesh) -> usize {
-    let mut first: FxHashMap<[u64; 3], u32> = FxHashMap::default();
-    first.reserve(mesh.positions.len());
-    let mut joined = 0;
-    let target: Vec<u32> = (0u32..)
-        .zip(&mesh.positions)
-        .map(|(v, p)| {
-            // Adding zero makes −0 and 0 one key.
-            let target = *first.entry((*p + DVec3::ZERO).to_array().map(f64::to_bits)).or_insert(v);
-            joined += usize::from(target != v);
-            target
-        })
-        .collect();
-    mesh.triangles.iter_mut().flatten().for_each(|v| *v = target[*v as usize]);
-    joined
+    /// About as many vertices are looked through at a time, so that their table stays in the cache.
+    const SHARE: usize = 1024;
+    let count = (mesh.positions.len() / SHARE).next_power_of_two();
+    // Adding zero makes −0 and 0 one key.
+    let key = |p: DVec3| (p + DVec3::ZERO).to_array().map(f64::to_bits);
+    let mut shares = vec![Vec::with_capacity(SHARE); count];
+    for (v, &p) in (0u32..).zip(&mesh.positions) {
+        // Neither the highest nor the lowest bits, which a table goes by.
+        shares[(FxBuildHasher.hash_one(key(p)) >> 32) as usize % count].push(v);
+    }
+    let positions = &mesh.positions;
+    let joined = |share: &Vec<u32>| -> Vec<(u32, u32)> {
+        let mut first = FxHashMap::with_capacity_and_hasher(share.len(), FxBuildHasher);
+        let target = |v: u32| (v, *first.entry(key(positions[v as usize])).or_insert(v));
+        share.iter().copied().map(target).filter(|(v, target)| v != target).collect()
+    };
+    let joined: Vec<Vec<(u32, u32)>> = shares.par_iter().map(joined).collect();
+    let count = joined.iter().map(Vec::len).sum();
+    if count > 0 {
+        let mut target: Vec<u32> = (0..mesh.positions.len() as u32).collect();
+        joined.iter().flatten().for_each(|&(v, first)| target[v as usize] = first);
+        mesh.triangles.par_iter_mut().for_each(|t| *t = t.map(|v| target[v as usize]));
+    }
+    count
 }
 
 /// Joins vertices at the ends of open edges that lie within [`CRACK_TOLERANCE`] of each other. Returns how many.
@@ -162,6 +180,11 @@ struct Patches {
 }
 
 impl Patches {
+    /// Of a surface that is one, closed and consistent.
+    fn one(triangles: usize) -> Self {
+        Self { of: vec![0; triangles], closed: vec![true] }
+    }
+
     /// Finds the patches and turns over the fewer triangles in each whose neighbours disagree.
     fn new(mesh: &mut TriangleMesh, uses: &[EdgeUse], findings: &mut MeshFindings) -> Self {
         const NONE: u32 = u32::MAX;
@@ -217,6 +240,21 @@ impl Patches {
         Self { of, closed }
     }
 
+    /// Signed volumes about the middle of the mesh.
+    fn volumes(&self, mesh: &TriangleMesh) -> Vec<f64> {
+        if self.closed.len() == 1 {
+            return vec![signed_volume(mesh)];
+        }
+        let mut volumes = vec![0.0; self.closed.len()];
+        if let Some((lo, hi)) = mesh.bounding_box() {
+            let middle = lo + (hi - lo) * 0.5;
+            for (t, &patch) in self.of.iter().enumerate() {
+                volumes[patch as usize] += volume_about(middle, mesh.corners(t));
+            }
+        }
+        volumes
+    }
+
     fn turn(&self, mesh: &mut TriangleMesh, patches: &FxHashSet<u32>) {
         for (triangle, patch) in mesh.triangles.iter_mut().zip(&self.of) {
             if patches.contains(patch) {
@@ -229,12 +267,7 @@ impl Patches {
 /// Turns outwards what faces inwards: all closed parts if their volume is negative, all open pieces together by their winding
 /// numbers, and single closed parts unless they are cavities.
 fn orient_outwards(mesh: &mut TriangleMesh, patches: &Patches, findings: &mut MeshFindings) {
-    let Some((lo, hi)) = mesh.bounding_box() else { return };
-    let middle = lo + (hi - lo) * 0.5;
-    let mut volumes = vec![0.0; patches.closed.len()];
-    for (t, &patch) in patches.of.iter().enumerate() {
-        volumes[patch as usize] += volume_about(middle, mesh.corners(t));
-    }
+    let mut volumes = patches.volumes(mesh);
     let ids = 0..patches.closed.len() as u32;
     let is_closed = |p: &u32| patches.closed[*p as usize];
     let mut turned: FxHashSet<u32> = FxHashSet::default();

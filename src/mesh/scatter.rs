@@ -113,10 +113,10 @@ pub(crate) fn leaves_near_triangles<R: Send>(
 
 const OPERATION: &str = "mesh to level set";
 
-/// Adds the tiles of `edge` voxels that hold a voxel within `reach` of a triangle, and perhaps some more.
+/// Adds the tiles of `edge` voxels, a power of two, that hold a voxel within `reach` of a triangle, and perhaps some more.
 pub(crate) fn tiles_near(tiles: &mut Vec<[i32; 3]>, [a, b, c]: [DVec3; 3], reach: f64, edge: i32) {
-    let tile = |p: IVec3| IVec3::new(p.x.div_euclid(edge), p.y.div_euclid(edge), p.z.div_euclid(edge));
-    let (lo, hi) = (tile(ceil(a.min(b).min(c) - reach)), tile(floor(a.max(b).max(c) + reach)));
+    let shift = edge.trailing_zeros();
+    let (lo, hi) = (ceil(a.min(b).min(c) - reach) >> shift, floor(a.max(b).max(c) + reach) >> shift);
     add_tiles(tiles, [a, b, c], reach, edge, lo, hi);
 }
 

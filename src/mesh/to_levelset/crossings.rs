@@ -7,7 +7,7 @@
 //! edges, vertices and in degenerate positions nothing is lost or counted twice, whatever the rounding, and the crossings of a
 //! closed mesh in a row add up to zero exactly.
 
-use glam::{DVec3, IVec3};
+use glam::{DVec3, IVec3, Vec3Swizzles};
 use rayon::prelude::*;
 
 use crate::grid::{LeafMask, leaf_origin};
@@ -18,6 +18,9 @@ const TILE: i32 = 32;
 /// Crossings nearer than this (in voxels) count as one place when levels between them are judged: rounding may order
 /// coincident triangles either way.
 const COINCIDENT: f64 = 1e-6;
+
+/// The axis along which levels are asked for.
+const Z: usize = 2;
 
 /// More than the rounding of a column at the largest coordinates, in voxels.
 const ROUNDING: f64 = 1e-6;
@@ -45,22 +48,35 @@ pub(super) struct Crossings {
 }
 
 impl Crossings {
-    /// Finds the crossings of the triangles, given in index space and fit for i32.
+    /// Finds the crossings of the triangles, given in index space and fit for i32, and overlaps along all axes: rows along z miss some in
+    /// what is thin and upright.
     pub fn new(count: usize, triangle: impl Fn(usize) -> [DVec3; 3] + Sync) -> Self {
-        let bins = Bins::new(count, |t, tiles: &mut Vec<[i32; 2]>| {
+        let bins = Bins::new(count, |t, tiles: &mut Vec<[i32; 3]>| {
             let [a, b, c] = triangle(t);
             // Columns are found with rounding, rows without. Most triangles smaller than a voxel have none.
             let (lo, hi) = (ceil(a.min(b).min(c) - ROUNDING), floor(a.max(b).max(c) + ROUNDING));
-            if lo.x > hi.x || lo.y > hi.y {
-                return;
-            }
-            for x in lo.x.div_euclid(TILE)..=hi.x.div_euclid(TILE) {
-                tiles.extend((lo.y.div_euclid(TILE)..=hi.y.div_euclid(TILE)).map(|y| [x, y]));
+            for axis in [0, 1, Z] {
+                let (x, y) = ((axis + 1) % 3, (axis + 2) % 3);
+                if lo[x] > hi[x] || lo[y] > hi[y] {
+                    continue;
+                }
+                for i in lo[x].div_euclid(TILE)..=hi[x].div_euclid(TILE) {
+                    tiles.extend((lo[y].div_euclid(TILE)..=hi[y].div_euclid(TILE)).map(|j| [axis as i32, i, j]));
+                }
             }
         });
-        let tile = |bin| scan_tile(*bins.key(bin), bins.items(bin), &triangle);
-        let mut tiles: Vec<Tile> = (0..bins.len()).into_par_iter().filter_map(tile).collect();
-        let overlaps = tiles.iter_mut().flat_map(|tile| std::mem::take(&mut tile.overlaps)).collect();
+        let tile = |bin| {
+            let &[axis, x, y] = bins.key(bin);
+            Some((axis as usize, scan_tile([x, y], bins.items(bin), |t| turned(triangle(t), axis as usize))?))
+        };
+        let mut found: Vec<(usize, Tile)> = (0..bins.len()).into_par_iter().filter_map(tile).collect();
+        let mut overlaps = Vec::new();
+        for (axis, tile) in &mut found {
+            // The axes of the tile are (axis + 1, axis + 2, axis).
+            let back = |o: IVec3| IVec3::from_array([0, 1, Z].map(|k| o[(k + Z - *axis) % 3]));
+            overlaps.extend(tile.overlaps.drain(..).map(back));
+        }
+        let tiles = found.into_iter().filter(|(axis, _)| *axis == Z).map(|(_, tile)| tile).collect();
         Self { tiles, overlaps }
     }
 
@@ -132,8 +148,18 @@ struct Found {
     height: f64,
 }
 
+/// A triangle seen along an axis: with that as z, and the same orientation.
+#[inline(always)]
+fn turned([a, b, c]: [DVec3; 3], axis: usize) -> [DVec3; 3] {
+    match axis {
+        0 => [a.yzx(), b.yzx(), c.yzx()],
+        1 => [a.zxy(), b.zxy(), c.zxy()],
+        _ => [a, b, c],
+    }
+}
+
 /// The crossings in one tile; `None` if there are none.
-fn scan_tile(key: [i32; 2], triangles: &[u32], triangle: &impl Fn(usize) -> [DVec3; 3]) -> Option<Tile> {
+fn scan_tile(key: [i32; 2], triangles: &[u32], triangle: impl Fn(usize) -> [DVec3; 3]) -> Option<Tile> {
     let mut found: Vec<Found> = Vec::with_capacity(triangles.len());
     for &t in triangles {
         scan_triangle(triangle(t as usize), key, &mut found);

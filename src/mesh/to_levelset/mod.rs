@@ -30,7 +30,7 @@ use rim::Rim;
 use super::bins::Bins;
 use super::prepare::prepare;
 use super::scatter::{UnsignedLeaf, distance_to_triangles, estimated_bytes, leaves_near_triangles, tiles_near};
-use super::topology::{boundary_chain, edge_uses};
+use super::topology::{boundary_chain, edge_uses, sum_of_triangles};
 use super::{Bvh, MeshFindings, TriangleMesh};
 use crate::error::{EditError, Result};
 use crate::grid::{LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, MAX_COORD, Transform, VOXEL_SIZES};
@@ -88,15 +88,16 @@ pub fn mesh_to_level_set(
     run: &RunOptions,
 ) -> Result<(LevelSet, MeshFindings)> {
     check_numbers(mesh)?;
-    check_room(mesh)?;
+    let bounds = mesh.bounding_box().unwrap_or_default();
+    check_room(bounds)?;
     params.validate()?;
-    check_range(mesh, params)?;
+    check_range(bounds, params)?;
     let (mut clean, mut findings) = prepare(mesh);
     if clean.triangles.is_empty() {
         return Err(nothing_left(mesh, &findings));
     }
-    clean.positions.iter_mut().for_each(|p| *p /= params.voxel_size);
-    reserve(&clean, params, run)?;
+    clean.positions.par_iter_mut().for_each(|p| *p /= params.voxel_size);
+    reserve(&clean, bounds, params, run)?;
     run.check(OPERATION)?;
 
     let corners = |t: usize| clean.corners(t);
@@ -109,9 +110,7 @@ pub fn mesh_to_level_set(
     // The crossings of a closed surface.
     let with_caps = |t: usize| caps.get(t.wrapping_sub(count)).copied().unwrap_or_else(|| corners(t));
     let crossings = Crossings::new(count + caps.len(), with_caps);
-    run.check(OPERATION)?;
-    let mut overlaps = crossings.overlaps().to_vec();
-    overlaps.extend(overlaps_sideways(count + caps.len(), with_caps));
+    let overlaps = crossings.overlaps().to_vec();
     run.check(OPERATION)?;
     let closed = chain.is_empty();
     findings.self_intersecting = closed && !overlaps.is_empty();
@@ -245,17 +244,15 @@ impl Work for Sign<'_> {
 /// Refuses indices out of range and positions that are no numbers.
 pub(super) fn check_numbers(mesh: &TriangleMesh) -> Result<()> {
     let vertices = mesh.positions.len();
-    if let Some((t, v)) = (0..)
-        .zip(&mesh.triangles)
-        .find_map(|(t, tri): (usize, _)| Some((t, *tri.iter().find(|&&v| v as usize >= vertices)?)))
-    {
+    let first_with = |refused: &(dyn Fn(u32) -> bool + Sync)| {
+        let of = |(t, triangle): (usize, &[u32; 3])| Some((t, *triangle.iter().find(|&&v| refused(v))?));
+        mesh.triangles.par_iter().enumerate().with_min_len(1024).find_map_first(of)
+    };
+    if let Some((t, v)) = first_with(&|v| v as usize >= vertices) {
         let problem = format!("triangle {t} uses vertex {v}, but there are only {vertices}");
         return Err(EditError::input("mesh", problem));
     }
-    if let Some((t, v)) = (0..)
-        .zip(&mesh.triangles)
-        .find_map(|(t, tri): (usize, _)| Some((t, *tri.iter().find(|&&v| !mesh.positions[v as usize].is_finite())?)))
-    {
+    if let Some((t, v)) = first_with(&|v| !mesh.positions[v as usize].is_finite()) {
         let problem =
             format!("vertex {v} (of triangle {t}) is at {}: coordinates must be finite", mesh.positions[v as usize]);
         return Err(EditError::input("mesh", problem));
@@ -264,8 +261,8 @@ pub(super) fn check_numbers(mesh: &TriangleMesh) -> Result<()> {
 }
 
 /// Refuses coordinates that no voxel size has room for.
-fn check_room(mesh: &TriangleMesh) -> Result<()> {
-    let farthest = mesh.bounding_box().map_or(0.0, |(lo, hi)| lo.abs().max(hi.abs()).max_element());
+fn check_room((lo, hi): (DVec3, DVec3)) -> Result<()> {
+    let farthest = lo.abs().max(hi.abs()).max_element();
     let room = f64::from(MAX_COORD) * VOXEL_SIZES.end();
     if farthest > room {
         let problem =
@@ -276,8 +273,7 @@ fn check_room(mesh: &TriangleMesh) -> Result<()> {
 }
 
 /// Refuses coordinates for which index space has no room.
-fn check_range(mesh: &TriangleMesh, params: &MeshToLevelSet) -> Result<()> {
-    let Some((lo, hi)) = mesh.bounding_box() else { return Ok(()) };
+fn check_range((lo, hi): (DVec3, DVec3), params: &MeshToLevelSet) -> Result<()> {
     let room = f64::from(MAX_COORD) - f64::from(params.half_width) - 64.0;
     let largest = lo.abs().max(hi.abs()).max_element();
     if largest / params.voxel_size > room {
@@ -290,26 +286,16 @@ fn check_range(mesh: &TriangleMesh, params: &MeshToLevelSet) -> Result<()> {
     Ok(())
 }
 
-/// Checks the memory limit before anything is allocated that grows with the resolution.
-fn reserve(mesh: &TriangleMesh, params: &MeshToLevelSet, run: &RunOptions) -> Result<()> {
-    let Some((lo, hi)) = mesh.bounding_box() else { return Ok(()) };
+/// Checks the memory limit before anything is allocated that grows with the resolution; the mesh in voxels, its bounds in world units.
+fn reserve(mesh: &TriangleMesh, (lo, hi): (DVec3, DVec3), params: &MeshToLevelSet, run: &RunOptions) -> Result<()> {
     let area = |t| {
         let [a, b, c] = mesh.corners(t);
         0.5 * (b - a).cross(c - a).length()
     };
-    let area: f64 = (0..mesh.triangles.len()).map(area).sum();
-    let needed = estimated_bytes(area, hi - lo, mesh.triangles.len(), f64::from(params.half_width));
+    let area = sum_of_triangles(mesh.triangles.len(), area);
+    let extent = (hi - lo) / params.voxel_size;
+    let needed = estimated_bytes(area, extent, mesh.triangles.len(), f64::from(params.half_width));
     run.reserve(OPERATION, needed, "take a larger voxel_size")
-}
-
-/// Leaves where rows along x or y find overlaps, which rows along z miss in what is thin and upright.
-fn overlaps_sideways(count: usize, triangle: impl Fn(usize) -> [DVec3; 3] + Sync) -> Vec<IVec3> {
-    // Cyclic permutations keep the orientation.
-    let along_x = Crossings::new(count, |t| triangle(t).map(|p| DVec3::new(p.y, p.z, p.x)));
-    let along_y = Crossings::new(count, |t| triangle(t).map(|p| DVec3::new(p.z, p.x, p.y)));
-    let back_x = along_x.overlaps().iter().map(|o| IVec3::new(o.z, o.x, o.y));
-    let back_y = along_y.overlaps().iter().map(|o| IVec3::new(o.y, o.z, o.x));
-    back_x.chain(back_y).collect()
 }
 
 fn encloses_a_voxel(level_set: &LevelSet) -> bool {
