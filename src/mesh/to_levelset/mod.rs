@@ -248,6 +248,10 @@ pub(super) fn check_numbers(mesh: &TriangleMesh) -> Result<()> {
         let of = |(t, triangle): (usize, &[u32; 3])| Some((t, *triangle.iter().find(|&&v| refused(v))?));
         mesh.triangles.par_iter().enumerate().with_min_len(1024).find_map_first(of)
     };
+    // One look at a mesh that is all right.
+    if first_with(&|v| !mesh.positions.get(v as usize).is_some_and(|p| p.is_finite())).is_none() {
+        return Ok(());
+    }
     if let Some((t, v)) = first_with(&|v| v as usize >= vertices) {
         let problem = format!("triangle {t} uses vertex {v}, but there are only {vertices}");
         return Err(EditError::input("mesh", problem));
