@@ -10,10 +10,8 @@
 use fearless_simd::{Simd, SimdBase, SimdMask};
 use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
-use smallvec::SmallVec;
 
 use super::marching::{EDGES, cell_case};
-use super::sharp::{may_be_sharp, sharp_edge};
 use crate::error::{EditError, Result};
 use crate::grid::{
     Face, Grid, LEAF_DIM, LEAF_VOXELS, LeafId, LeafMask, LeafValues, Neighbours, leaf_offset, neighbour_index,
@@ -26,12 +24,6 @@ use crate::stencil::simd::{Lanes, Work, dispatch};
 /// is degenerate where φ = iso at a voxel. Far below the accuracy of linear interpolation; still resolved by f32
 /// files up to 4096 voxels from the origin.
 pub(crate) const VERTEX_MARGIN: f64 = 1.0 / 4096.0;
-
-/// Least height of a triangle at a sharp edge, in voxels.
-const LEAST_HEIGHT: f32 = 1e-3;
-
-/// Most triangles at a sharp edge over those of the polygons: three for each, and one for each of up to seven vertices.
-pub(crate) const SHARP_TRIANGLES: u64 = 7;
 
 /// Where φ = iso between two voxels with values `a` and `b` on different sides, 0..1.
 #[inline(always)]
@@ -160,7 +152,7 @@ impl SurfaceLeaf {
 /// The surface φ = iso of a grid: its leaves in the order of their origins, with numbered vertices.
 pub(crate) struct IsoSurface<'a> {
     grid: &'a Grid,
-    iso: f32,
+    pub(super) iso: f32,
     /// Inside voxels by slot, sentinels included.
     signs: Vec<LeafMask>,
     leaves: Vec<SurfaceLeaf>,
@@ -302,74 +294,29 @@ impl<'a> IsoSurface<'a> {
         }
     }
 
-    /// Calls `f` with the first corner of a cell of the leaf and a triangle, relative to that corner, between a sharp convex edge of the solid
-    /// `side`·(φ − iso) < 0 and the polygon of the cell, for each of the cells that are `wanted` and have such an edge ([`sharp_edge`]).
-    /// `scale` is one over the voxel size.
-    pub fn for_each_sharp_triangle(
-        &self,
-        leaf: &SurfaceLeaf,
-        (side, scale): (f32, f32),
-        wanted: impl Fn(IVec3) -> bool,
-        mut f: impl FnMut(IVec3, [Vec3; 3]),
-    ) {
-        let values = self.values_of_cells(leaf);
-        let origin = self.grid.origin(leaf.id);
-        let mut accessor = self.grid.accessor();
-        let scaled = values.map(|value| value * scale);
-        self.rows(leaf).for_each_cell(|cell, pattern| {
-            let first = (cell.x * 81 + cell.y * 9 + cell.z) as usize;
-            let corners = [0, 1, 9, 10, 81, 82, 90, 91].map(|step| scaled[first + step]);
-            let case = cell_case(pattern);
-            // Two pieces of surface in one cell are thinner than what differences tell apart.
-            if case.loops != 1 || !may_be_sharp(&corners) || !wanted(cell) {
-                return;
-            }
-            let vertices = self.vertices_of_cell(&values, cell, case.crossed);
-            let crossings: SmallVec<[Vec3; 12]> =
-                (0..12).filter(|edge| case.crossed >> edge & 1 == 1).map(|edge| vertices[edge]).collect();
-            let Some([from, to]) = sharp_edge(&mut accessor, origin + cell, &crossings, (self.iso, side, scale)) else {
-                return;
-            };
-            let mut emit = |triangle: [Vec3; 3]| {
-                let [a, b, c] = triangle;
-                let longest = a.distance(b).max(b.distance(c)).max(c.distance(a));
-                if (b - a).cross(c - a).length() > LEAST_HEIGHT * longest {
-                    f(cell, triangle);
-                }
-            };
-            crossings.iter().for_each(|vertex| emit([from, to, *vertex]));
-            for triangle in &case.triangles {
-                let [a, b, c] = triangle.map(|edge| vertices[usize::from(edge)]);
-                for [a, b] in [[a, b], [b, c], [c, a]] {
-                    // To the nearer end.
-                    let end = if from.distance_squared((a + b) / 2.0) <= to.distance_squared((a + b) / 2.0) {
-                        from
-                    } else {
-                        to
-                    };
-                    emit([end, a, b]);
-                }
-            }
-        });
-    }
-
     /// φ at the corners of a leaf's cells: its voxels and those next to its upper sides, 9³ in all.
-    fn values_of_cells(&self, leaf: &SurfaceLeaf) -> [f32; 729] {
+    pub(super) fn values_of_cells(&self, leaf: &SurfaceLeaf) -> [f32; 729] {
         let around = &self.grid.neighbours()[leaf.id.index()];
         let mut values = [0.0; 729];
-        for (at, row) in values.as_chunks_mut::<9>().0.iter_mut().enumerate() {
-            let (x, y) = (at / 9, at % 9);
-            let of = |z| &self.grid.values(around[neighbour_index(IVec3::new(x as i32 / 8, y as i32 / 8, z))]).0;
-            let first = (x % 8) * 64 + (y % 8) * 8;
-            row[..8].copy_from_slice(&of(0)[first..first + 8]);
-            row[8] = of(1)[first];
+        // The leaf and those above it, x first.
+        let mut leaves = [&self.grid.values(leaf.id).0; 8];
+        for (c, leaf) in leaves.iter_mut().enumerate() {
+            *leaf = &self.grid.values(around[neighbour_index(corner(c))]).0;
+        }
+        for (x, slab) in values.as_chunks_mut::<81>().0.iter_mut().enumerate() {
+            for (y, row) in slab.as_chunks_mut::<9>().0.iter_mut().enumerate() {
+                let [own, above] = [leaves[x / 8 * 4 + y / 8 * 2], leaves[x / 8 * 4 + y / 8 * 2 + 1]];
+                let first = x % 8 * 64 + y % 8 * 8;
+                row[..8].copy_from_slice(&own[first..first + 8]);
+                row[8] = above[first];
+            }
         }
         values
     }
 
     /// The vertices on the `crossed` edges of a cell, relative to its first corner.
     #[inline(always)]
-    fn vertices_of_cell(&self, values: &[f32; 729], cell: IVec3, crossed: u16) -> [Vec3; 12] {
+    pub(super) fn vertices_of_cell(&self, values: &[f32; 729], cell: IVec3, crossed: u16) -> [Vec3; 12] {
         let first = (cell.x * 81 + cell.y * 9 + cell.z) as usize;
         let mut vertices = [Vec3::ZERO; 12];
         let mut rest = crossed;

@@ -18,7 +18,7 @@ pub(crate) mod marching;
 mod measure;
 pub(crate) mod sample;
 pub mod shapes;
-mod sharp;
+pub(crate) mod sharp;
 pub mod smooth_csg;
 mod specks;
 mod sweep;

@@ -158,3 +158,91 @@ fn spread(mut bits: u32) -> u32 {
     bits = (bits | bits << 4) & 0x030c_30c3;
     (bits | bits << 2) & 0x0924_9249
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::distance_to_triangles;
+    use crate::mesh::testing::sphere;
+    use crate::run::RunOptions;
+
+    /// Exact squares of the distances from one tile's voxels, up to a limit.
+    fn check(triangles: &[[DVec3; 3]], tile: IVec3, half_width: f32) {
+        let of = |t: usize| triangles[t];
+        let numbers: Vec<u32> = (0..triangles.len() as u32).collect();
+        let (mut gather, mut rest) = (Gather::default(), Vec::new());
+        gather.take(tile, &numbers, &of, half_width, &mut rest);
+        let taken = triangles.len() - rest.len();
+        assert!(taken > triangles.len() / 2, "{taken} of {}", triangles.len());
+        let limit = half_width * half_width;
+        let mut values = vec![limit; (TILE * TILE * TILE) as usize];
+        let mut touched = std::collections::BTreeSet::new();
+        gather.lower(tile, &of, half_width, &mut values, |block| drop(touched.insert(block.to_array())));
+        let left: Vec<[DVec3; 3]> =
+            numbers.iter().filter(|t| !rest.contains(t)).map(|&t| triangles[t as usize]).collect();
+        let bvh = crate::mesh::Bvh::new(left);
+        let mut inside = 0;
+        for (at, &squared) in (0..).zip(&values) {
+            let local = IVec3::new(at / (TILE * TILE), at / TILE % TILE, at % TILE);
+            let truth = bvh.closest_point((tile + local).as_dvec3(), f64::INFINITY).unwrap().distance_squared.sqrt();
+            let expected = truth.min(f64::from(half_width));
+            assert!(
+                (f64::from(squared.sqrt()) - expected).abs() < 1e-6 * (1.0 + expected),
+                "{local}: {squared} {truth}"
+            );
+            if squared < limit {
+                inside += 1;
+                assert!(touched.contains(&(local / BLOCK * BLOCK).to_array()), "{local}");
+            }
+        }
+        assert!(inside > 1000, "{inside}");
+    }
+
+    fn dense_ball(centre: DVec3, radius: f64) -> Vec<[DVec3; 3]> {
+        let mesh = sphere(centre, radius, 120);
+        (0..mesh.triangles.len()).map(|t| mesh.corners(t)).collect()
+    }
+
+    #[test]
+    fn small_triangles_are_exact_and_others_are_left() {
+        let mut triangles = dense_ball(DVec3::new(40.3, -20.1, 5.2), 11.0);
+        check(&triangles, IVec3::new(32, -32, 0), 3.0);
+        // Too large, and without area.
+        triangles.push([DVec3::new(33.0, -30.0, 1.0), DVec3::new(60.0, -30.0, 1.0), DVec3::new(33.0, -4.0, 9.0)]);
+        triangles.push([DVec3::new(34.0, -29.0, 1.0); 3]);
+        check(&triangles, IVec3::new(32, -32, 0), 3.0);
+        check(&triangles, IVec3::new(32, -32, 0), 9.0);
+        // Far from the origin.
+        let far = IVec3::new(1 << 20, -(1 << 24), 1 << 13);
+        let shifted = |t: [DVec3; 3]| t.map(|p| p + far.as_dvec3());
+        check(&triangles.iter().copied().map(shifted).collect::<Vec<_>>(), far + IVec3::new(32, -32, 0), 3.0);
+    }
+
+    #[test]
+    fn large_triangles_are_left_to_be_scattered() {
+        let mesh = sphere(DVec3::splat(16.0), 12.0, 6);
+        let numbers: Vec<u32> = (0..mesh.triangles.len() as u32).collect();
+        let (mut gather, mut rest) = (Gather::default(), Vec::new());
+        gather.take(IVec3::ZERO, &numbers, &|t| mesh.corners(t), 3.0, &mut rest);
+        assert_eq!(rest, numbers);
+    }
+
+    #[test]
+    fn both_ways_together_are_exact() {
+        // A finely divided ball on a plate of two triangles.
+        let mut triangles = dense_ball(DVec3::new(3.0, 2.0, 9.0), 9.5);
+        let [a, b, c, d] =
+            [(-40.0, -40.0), (40.0, -40.0), (40.0, 40.0), (-40.0, 40.0)].map(|(x, y)| DVec3::new(x, y, 0.2));
+        triangles.extend([[a, b, c], [a, c, d]]);
+        let leaves = distance_to_triangles(triangles.len(), |t| triangles[t], 4.0, &RunOptions::default()).unwrap();
+        let bvh = crate::mesh::Bvh::new(triangles);
+        for leaf in &leaves {
+            for at in (0..512).step_by(7) {
+                let ijk = leaf.origin + crate::grid::offset_to_local(at);
+                let truth = bvh.closest_point(ijk.as_dvec3(), f64::INFINITY).unwrap().distance_squared.sqrt().min(4.0);
+                assert!((f64::from(leaf.distance.0[at]) - truth).abs() < 1e-5, "{ijk}");
+            }
+        }
+        assert!(leaves.len() > 100);
+    }
+}

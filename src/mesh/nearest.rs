@@ -20,7 +20,8 @@ use super::cluster::{Candidates, Clusters, SLACK};
 use crate::error::Result;
 use crate::grid::{Grid, LEAF_DIM, LEAF_VOXELS, LeafMask, LeafValues, leaf_offset};
 use crate::levelset::BYTES_A_LEAF;
-use crate::levelset::isosurface::{IsoSurface, SHARP_TRIANGLES};
+use crate::levelset::isosurface::IsoSurface;
+use crate::levelset::sharp::SharpEdges;
 use crate::run::RunOptions;
 
 /// Where distances are wanted, in voxels: where the distance from the surface, less `offset`, is within the half width.
@@ -88,7 +89,10 @@ pub(super) fn leaves_of_band(
     wanted: impl Fn(IVec3, IVec3) -> bool + Sync,
     run: &RunOptions,
 ) -> Result<Vec<Vec<Leaf>>> {
-    let search = Search { sources: Sources::new(surface, field), surface, field, iso, band, wanted: &wanted };
+    // Outwards the edges of the inside count, inwards those of the outside.
+    let of = (if band.offset >= 0.0 { 1.0 } else { -1.0 }, band.voxel_size.recip() as f32);
+    let sharp = band.sharp.then(|| SharpEdges::new(surface, field, of, operation, run)).transpose()?;
+    let search = Search { sources: Sources::new(surface, field), surface, sharp, field, iso, band, wanted: &wanted };
     let mut tiles = search.sources.tiles_within(band.reach());
     tiles.retain(|&tile| {
         let (first, last) = tile_bounds(tile);
@@ -192,6 +196,8 @@ struct Scratch {
 struct Search<'a> {
     sources: Sources,
     surface: &'a IsoSurface<'a>,
+    /// Its sharp edges, if they are to be kept.
+    sharp: Option<SharpEdges>,
     field: &'a Grid,
     iso: f32,
     band: Band,
@@ -228,8 +234,11 @@ impl Search<'_> {
             if self.inside(bounds.0) { self.band.side(-hi, -lo) } else { self.band.side(lo, hi) }
         };
         near.retain(|(_, gap)| side == Side::Near && *gap <= *farthest);
-        let polygons: u64 = near.iter().map(|&(place, _)| u64::from(self.surface.leaves()[place].triangles)).sum();
-        if self.band.sharp { polygons * (1 + SHARP_TRIANGLES) } else { polygons }
+        let triangles = |&(place, _): &(usize, i32)| {
+            let sharp = self.sharp.as_ref().map_or(0, |edges| edges.triangles_at_most(place));
+            u64::from(self.surface.leaves()[place].triangles) + sharp
+        };
+        near.iter().map(triangles).sum()
     }
 
     /// The box of the leaves of a tile that are wanted. At an offset the tile itself: blocks that reach beyond the box are then judged by the sign of a voxel
@@ -261,11 +270,8 @@ impl Search<'_> {
             self.surface.for_each_triangle(leaf, wanted, |cell, corners| {
                 clusters.push((from + cell - first).as_vec3(), corners);
             });
-            if self.band.sharp {
-                // Outwards the edges of the inside count, inwards those of the outside.
-                let side = if self.band.offset >= 0.0 { 1.0 } else { -1.0 };
-                let of = (side, self.band.voxel_size.recip() as f32);
-                self.surface.for_each_sharp_triangle(leaf, of, wanted, |cell, corners| {
+            if let Some(edges) = &self.sharp {
+                edges.for_each_triangle(self.surface, place, wanted, |cell, corners| {
                     clusters.push((from + cell - first).as_vec3(), corners);
                 });
             }

@@ -34,6 +34,8 @@ impl Cube {
         if self.width == 1 {
             // A constant: copies of a length known at run time would be calls.
             self.gather_rows(1, values, around, voxels);
+        } else if self.width == 3 {
+            self.gather_rows(3, values, around, voxels);
         } else if self.width == 4 {
             self.gather_rows(4, values, around, voxels);
         } else {
