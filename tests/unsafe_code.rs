@@ -3,8 +3,13 @@
 use std::path::{Path, PathBuf};
 
 /// The files, and how often each says the word.
-const ALLOWED: [(&str, usize); 4] =
-    [("src/grid/prefetch.rs", 1), ("src/vdb/bridge.rs", 9), ("src/vdb/write.rs", 9), ("tests/steady_state.rs", 5)];
+const ALLOWED: [(&str, usize); 5] = [
+    ("src/grid/prefetch.rs", 1),
+    ("src/stencil/results.rs", 2),
+    ("src/vdb/bridge.rs", 9),
+    ("src/vdb/write.rs", 9),
+    ("tests/steady_state.rs", 5),
+];
 
 fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
     for entry in std::fs::read_dir(folder).unwrap().flatten() {

@@ -177,7 +177,9 @@ mod tests {
         let limit = half_width * half_width;
         let mut values = vec![limit; (TILE * TILE * TILE) as usize];
         let mut touched = std::collections::BTreeSet::new();
-        gather.lower(tile, &of, half_width, &mut values, |block| drop(touched.insert(block.to_array())));
+        gather.lower(tile, &of, half_width, &mut values, |block| {
+            touched.insert(block.to_array());
+        });
         let left: Vec<[DVec3; 3]> =
             numbers.iter().filter(|t| !rest.contains(t)).map(|&t| triangles[t as usize]).collect();
         let bvh = crate::mesh::Bvh::new(left);
