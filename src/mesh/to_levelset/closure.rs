@@ -27,42 +27,50 @@ const AXES: [IVec3; 3] = [IVec3::X, IVec3::Y, IVec3::Z];
 /// Leaves of distances, found by origin.
 #[derive(Default)]
 pub(super) struct DistanceLeaves {
-    leaves: Vec<UnsignedLeaf>,
-    index: FxHashMap<IVec3, usize>,
+    /// As they were made, tile by tile: leaves are large, and not moved.
+    parts: Vec<Vec<UnsignedLeaf>>,
+    /// Part, and place in it.
+    index: FxHashMap<IVec3, (usize, usize)>,
 }
 
 impl DistanceLeaves {
-    pub fn new(leaves: Vec<UnsignedLeaf>) -> Self {
-        let index = leaves.iter().enumerate().map(|(i, leaf)| (leaf.origin, i)).collect();
-        Self { leaves, index }
+    pub fn new(parts: Vec<Vec<UnsignedLeaf>>) -> Self {
+        let mut index = FxHashMap::default();
+        for (part, leaves) in parts.iter().enumerate() {
+            index.extend(leaves.iter().enumerate().map(|(i, leaf)| (leaf.origin, (part, i))));
+        }
+        Self { parts, index }
     }
 
     pub fn find(&self, origin: IVec3) -> Option<&LeafValues> {
-        self.index.get(&origin).map(|&i| &self.leaves[i].distance)
+        self.index.get(&origin).map(|&(part, i)| &self.parts[part][i].distance)
     }
 
     pub fn origins(&self) -> impl Iterator<Item = IVec3> + '_ {
-        self.leaves.iter().map(|leaf| leaf.origin)
+        self.parts.iter().flatten().map(|leaf| leaf.origin)
     }
 
-    pub fn leaves(&self) -> &[UnsignedLeaf] {
-        &self.leaves
+    /// The leaves, part by part.
+    pub fn parts(&self) -> &[Vec<UnsignedLeaf>] {
+        &self.parts
     }
 
     /// Lowers the distances to those of `other`.
     pub fn merge(&mut self, other: Vec<UnsignedLeaf>) {
+        let (part, mut new) = (self.parts.len(), Vec::new());
         for leaf in other {
             match self.index.get(&leaf.origin) {
-                Some(&i) => {
-                    let values = &mut self.leaves[i].distance.0;
+                Some(&(part, i)) => {
+                    let values = &mut self.parts[part][i].distance.0;
                     values.iter_mut().zip(&leaf.distance.0).for_each(|(a, b)| *a = a.min(*b));
                 }
                 None => {
-                    self.index.insert(leaf.origin, self.leaves.len());
-                    self.leaves.push(leaf);
+                    self.index.insert(leaf.origin, (part, new.len()));
+                    new.push(leaf);
                 }
             }
         }
+        self.parts.push(new);
     }
 }
 

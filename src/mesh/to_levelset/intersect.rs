@@ -83,13 +83,14 @@ fn touch(a: [DVec3; 3], b: [DVec3; 3]) -> bool {
     let (ea, eb) = (edges(a), edges(b));
     let (na, nb) = (ea[0].cross(ea[1]), eb[0].cross(eb[1]));
     let separates = |axis: DVec3| {
-        let Some(axis) = axis.try_normalize() else { return false };
         let range = |t: [DVec3; 3]| {
-            let [x, y, z] = t.map(|corner| axis.dot(corner - a[0]));
+            let (x, y, z) = (axis.dot(t[0] - a[0]), axis.dot(t[1] - a[0]), axis.dot(t[2] - a[0]));
             (x.min(y).min(z), x.max(y).max(z))
         };
         let ((a_lo, a_hi), (b_lo, b_hi)) = (range(a), range(b));
-        a_hi + TOUCH < b_lo || b_hi + TOUCH < a_lo
+        // In lengths of the axis. Most gaps are none, and need no root.
+        let gap = (b_lo - a_hi).max(a_lo - b_hi);
+        gap > 0.0 && gap > TOUCH * axis.length()
     };
     let in_plane = ea.iter().map(|e| na.cross(*e)).chain(eb.iter().map(|e| nb.cross(*e)));
     let across = ea.iter().flat_map(|x| eb.iter().map(|y| x.cross(*y)));

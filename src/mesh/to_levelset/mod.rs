@@ -127,7 +127,7 @@ pub fn mesh_to_level_set(
         let (tree, caps) = (Bvh::new((0..count).map(corners).collect()), Bvh::new(caps));
         let rim = Rim::new(&clean.positions, &chain);
         let doubts = Doubts { inside: Inside::new(crossings, &tree, &caps, &rim), overlaps, tree: &tree, rim: &rim };
-        vec![repair(&clean, &doubts, params, &mut findings, run)?]
+        repair(&clean, &doubts, params, &mut findings, run)?
     };
     let level_set = LevelSet::new(grid_of_parts(background, &leaves), transform);
     if !encloses_a_voxel(&level_set) {
@@ -171,14 +171,16 @@ fn repair(
     params: &MeshToLevelSet,
     findings: &mut MeshFindings,
     run: &RunOptions,
-) -> Result<Vec<SignedLeaf>> {
+) -> Result<Vec<Vec<SignedLeaf>>> {
     let half_width = params.half_width;
     let doubtful = doubts.triangles(clean);
     run.check(OPERATION)?;
     let pieces = separating_pieces(clean, &doubtful, doubts, run)?;
     findings.removed_area_fraction = pieces.removed_area_fraction;
     run.check(OPERATION)?;
-    let mut kept = DistanceLeaves::new(distance_to_triangles(pieces.kept.len(), |t| pieces.kept[t], half_width, run)?);
+    let leaf = |origin, distance: &LeafValues| Some(UnsignedLeaf { origin, distance: distance.clone() });
+    let corners = |t: usize| pieces.kept[t];
+    let mut kept = DistanceLeaves::new(leaves_near_triangles(pieces.kept.len(), corners, half_width, run, leaf)?);
     // The surface may go on where triangles were left out.
     let suspects: Vec<IVec3> = if pieces.removed_area_fraction > 0.0 {
         let marked: Vec<usize> = (0..doubtful.len()).filter(|&t| doubtful[t]).collect();
@@ -196,7 +198,7 @@ fn repair(
     let signed = |leaf: &UnsignedLeaf| {
         signed(leaf.origin, &leaf.distance, &surroundings.mask(leaf.origin).copied().unwrap_or_default(), params)
     };
-    Ok(kept.leaves().par_iter().filter_map(signed).collect())
+    Ok(kept.parts().par_iter().map(|part| part.iter().filter_map(signed).collect()).collect())
 }
 
 /// Values and mask of a leaf at its origin.
