@@ -17,6 +17,9 @@ const THINNEST: f64 = 1e-4;
 /// The widest band, in voxels: triangles around a tile are few beside its own up to here.
 const WIDEST: f32 = 16.0;
 
+/// Triangles that are put into clusters at a time: 25 MB, however many there are.
+const AT_A_TIME: usize = 1 << 18;
+
 /// The most that others may have of the area: around few triangles more voxels look them up than their area tells, and the others lower
 /// the same voxels again.
 const MOST_LEFT: f64 = 0.25;
@@ -84,26 +87,28 @@ impl Gather {
         triangle: &impl Fn(usize) -> [DVec3; 3],
         half_width: f32,
         values: &mut [f32],
-        touch: impl FnMut(IVec3),
+        mut touch: impl FnMut(IVec3),
     ) {
         let Self { order, clusters, lists } = self;
         if order.is_empty() {
             return;
         }
         order.sort_unstable();
-        clusters.clear();
-        for &place_and_number in order.iter() {
-            let corners = triangle(place_and_number as u32 as usize);
-            let voxel = floor(corners[0]);
-            let origin = voxel.as_dvec3();
-            // By hand: a closure would not be inlined.
-            let [a, b, c] = corners;
-            let corners = [(a - origin).as_vec3(), (b - origin).as_vec3(), (c - origin).as_vec3()];
-            clusters.push((voxel - tile).as_vec3(), corners);
+        // A minimum does not depend on how they are divided.
+        for part in order.chunks(AT_A_TIME) {
+            clusters.clear();
+            for &place_and_number in part {
+                let [a, b, c] = triangle(place_and_number as u32 as usize);
+                let voxel = floor(a);
+                let origin = voxel.as_dvec3();
+                // By hand: a closure would not be inlined.
+                let corners = [(a - origin).as_vec3(), (b - origin).as_vec3(), (c - origin).as_vec3()];
+                clusters.push((voxel - tile).as_vec3(), corners);
+            }
+            clusters.finish();
+            let mut tile = Tile { clusters, half_width, values, touch: &mut touch };
+            tile.halves(Block::WHOLE, &clusters.boxes, lists);
         }
-        clusters.finish();
-        let mut tile = Tile { clusters, half_width, values, touch };
-        tile.halves(Block::WHOLE, &clusters.boxes, lists);
     }
 }
 

@@ -67,7 +67,7 @@ fn weld_equal(mesh: &mut TriangleMesh) -> usize {
     let count = (mesh.positions.len() / SHARE).next_power_of_two();
     // Adding zero makes −0 and 0 one key.
     let key = |p: DVec3| (p + DVec3::ZERO).to_array().map(f64::to_bits);
-    let mut shares = vec![Vec::with_capacity(SHARE); count];
+    let mut shares: Vec<Vec<u32>> = (0..count).map(|_| Vec::with_capacity(SHARE)).collect();
     for (v, &p) in (0u32..).zip(&mesh.positions) {
         // Neither the highest nor the lowest bits, which a table goes by.
         shares[(FxBuildHasher.hash_one(key(p)) >> 32) as usize % count].push(v);

@@ -24,6 +24,9 @@ const APART: f32 = 1.0 + 1e-5;
 
 const AXES: [IVec3; 3] = [IVec3::X, IVec3::Y, IVec3::Z];
 
+/// Leaves of a part that is added: a part is what one task works on.
+const LEAVES_OF_A_PART: usize = 64;
+
 /// Leaves of distances, found by origin.
 #[derive(Default)]
 pub(super) struct DistanceLeaves {
@@ -57,7 +60,7 @@ impl DistanceLeaves {
 
     /// Lowers the distances to those of `other`.
     pub fn merge(&mut self, other: Vec<UnsignedLeaf>) {
-        let (part, mut new) = (self.parts.len(), Vec::new());
+        let before = self.parts.len();
         for leaf in other {
             match self.index.get(&leaf.origin) {
                 Some(&(part, i)) => {
@@ -65,12 +68,15 @@ impl DistanceLeaves {
                     values.iter_mut().zip(&leaf.distance.0).for_each(|(a, b)| *a = a.min(*b));
                 }
                 None => {
-                    self.index.insert(leaf.origin, (part, new.len()));
-                    new.push(leaf);
+                    if self.parts[before..].last().is_none_or(|part| part.len() == LEAVES_OF_A_PART) {
+                        self.parts.push(Vec::with_capacity(LEAVES_OF_A_PART));
+                    }
+                    let part = self.parts.len() - 1;
+                    self.index.insert(leaf.origin, (part, self.parts[part].len()));
+                    self.parts[part].push(leaf);
                 }
             }
         }
-        self.parts.push(new);
     }
 }
 

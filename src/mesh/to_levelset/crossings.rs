@@ -52,7 +52,8 @@ impl Crossings {
     /// what is thin and upright.
     pub fn new(count: usize, triangle: impl Fn(usize) -> [DVec3; 3] + Sync) -> Self {
         let bins = Bins::new(count, |t, tiles: &mut Vec<[i32; 3]>| {
-            let [a, b, c] = triangle(t);
+            let corners = triangle(t);
+            let [a, b, c] = corners;
             // Columns are found with rounding, rows without. Most triangles smaller than a voxel have none.
             let (lo, hi) = (ceil(a.min(b).min(c) - ROUNDING), floor(a.max(b).max(c) + ROUNDING));
             for axis in [0, 1, Z] {
@@ -60,24 +61,37 @@ impl Crossings {
                 if lo[x] > hi[x] || lo[y] > hi[y] {
                     continue;
                 }
-                for i in lo[x].div_euclid(TILE)..=hi[x].div_euclid(TILE) {
-                    tiles.extend((lo[y].div_euclid(TILE)..=hi[y].div_euclid(TILE)).map(|j| [axis as i32, i, j]));
+                let columns = lo[x].div_euclid(TILE)..=hi[x].div_euclid(TILE);
+                let (first, last) = (lo[y].div_euclid(TILE), hi[y].div_euclid(TILE));
+                let is_large = columns.end() - columns.start() > 1 && last - first > 1;
+                for i in columns {
+                    let (mut first, mut last) = (first, last);
+                    if is_large {
+                        let (from, to) = extent_in_strip(corners, [x, y], i);
+                        if from > to {
+                            continue;
+                        }
+                        // Of long edges the ends are rounded more than columns; a voxel covers that by far.
+                        first = first.max(ceil1(from - 1.0).div_euclid(TILE));
+                        last = last.min(ceil1(to + 1.0).div_euclid(TILE));
+                    }
+                    tiles.extend((first..=last).map(|j| [axis as i32, i, j]));
                 }
             }
         });
-        let tile = |bin| {
+        // Of the axes beside Z only the overlaps are wanted.
+        let scan = |bin| {
             let &[axis, x, y] = bins.key(bin);
-            Some((axis as usize, scan_tile([x, y], bins.items(bin), |t| turned(triangle(t), axis as usize))?))
-        };
-        let mut found: Vec<(usize, Tile)> = (0..bins.len()).into_par_iter().filter_map(tile).collect();
-        let mut overlaps = Vec::new();
-        for (axis, tile) in &mut found {
+            let axis = axis as usize;
+            let mut tile = scan_tile([x, y], bins.items(bin), |t| turned(triangle(t), axis))?;
             // The axes of the tile are (axis + 1, axis + 2, axis).
-            let back = |o: IVec3| IVec3::from_array([0, 1, Z].map(|k| o[(k + Z - *axis) % 3]));
-            overlaps.extend(tile.overlaps.drain(..).map(back));
-        }
-        let tiles = found.into_iter().filter(|(axis, _)| *axis == Z).map(|(_, tile)| tile).collect();
-        Self { tiles, overlaps }
+            let back = |o: IVec3| IVec3::from_array([0, 1, Z].map(|k| o[(k + Z - axis) % 3]));
+            let overlaps: Vec<IVec3> = std::mem::take(&mut tile.overlaps).into_iter().map(back).collect();
+            Some(((axis == Z).then_some(tile), overlaps))
+        };
+        let found: Vec<(Option<Tile>, Vec<IVec3>)> = (0..bins.len()).into_par_iter().filter_map(scan).collect();
+        let (tiles, overlaps): (Vec<_>, Vec<_>) = found.into_iter().unzip();
+        Self { tiles: tiles.into_iter().flatten().collect(), overlaps: overlaps.concat() }
     }
 
     /// Leaves where a row passes to or from levels other than 0 and 1: parts of the surface lie inside each other or
@@ -146,6 +160,25 @@ struct Found {
     row: u32,
     step: i32,
     height: f64,
+}
+
+/// Where along axis `y` a triangle lies within the strip of tiles number `strip` along axis `x`, which it meets.
+fn extent_in_strip(corners: [DVec3; 3], [x, y]: [usize; 2], strip: i32) -> (f64, f64) {
+    // The voxels of the strip, and what rounding may add.
+    let (from, to) = (f64::from(strip * TILE) - ROUNDING, f64::from(strip * TILE + TILE - 1) + ROUNDING);
+    let (mut lo, mut hi) = (f64::INFINITY, f64::NEG_INFINITY);
+    for (p, q) in [(0, 1), (1, 2), (2, 0)] {
+        let (p, q) = (corners[p], corners[q]);
+        let (p, q) = if p[x] <= q[x] { (p, q) } else { (q, p) };
+        if q[x] < from || p[x] > to {
+            continue;
+        }
+        // An edge square to the axis counts with both ends.
+        let at = |limit: f64| p[y] + (q[y] - p[y]) * ((limit - p[x]) / (q[x] - p[x])).clamp(0.0, 1.0);
+        let ends = if q[x] > p[x] { [at(p[x].max(from)), at(q[x].min(to))] } else { [p[y], q[y]] };
+        (lo, hi) = (lo.min(ends[0]).min(ends[1]), hi.max(ends[0]).max(ends[1]));
+    }
+    (lo, hi)
 }
 
 /// A triangle seen along an axis: with that as z, and the same orientation.
@@ -245,6 +278,33 @@ mod tests {
 
     fn inside(crossings: &Crossings, ijk: IVec3) -> bool {
         crossings.inside(crate::grid::leaf_origin(ijk)).get(leaf_offset(ijk))
+    }
+
+    #[test]
+    fn large_slanted_triangles_are_in_the_tiles_that_they_meet_and_in_few_others() {
+        // A bar along the diagonal of space: its box has 31² tiles seen from each side.
+        let along = DVec3::splat(1.0).normalize();
+        let (u, v) = (along.any_orthonormal_vector(), along.cross(along.any_orthonormal_vector()));
+        let mut bar = cube(DVec3::splat(-0.5), 1.0);
+        for p in &mut bar.positions {
+            *p = along * p.z * 1731.0 + u * p.x * 9.0 + v * p.y * 9.0 + DVec3::new(0.3, 0.1, -0.2);
+        }
+        let (found, mut state) = (crossings(&bar), 1u64);
+        assert!(found.overlaps.is_empty() && found.tiles.len() < 150, "{}", found.tiles.len());
+        let mut random = |n: f64| {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            ((state >> 33) as f64 / (1u64 << 31) as f64 - 0.5) * n
+        };
+        let mut within = 0;
+        for _ in 0..4000 {
+            let p = along * random(1760.0) + u * random(14.0) + v * random(14.0);
+            let ijk = p.round().as_ivec3();
+            let q = ijk.as_dvec3() - DVec3::new(0.3, 0.1, -0.2);
+            let beyond = DVec3::new(q.dot(u).abs() - 4.5, q.dot(v).abs() - 4.5, q.dot(along).abs() - 865.5);
+            assert_eq!(found.level(ijk), i32::from(beyond.max_element() < 0.0), "{ijk}");
+            within += found.level(ijk);
+        }
+        assert!(within > 1000, "{within}");
     }
 
     #[test]

@@ -97,7 +97,7 @@ pub fn mesh_to_level_set(
         return Err(nothing_left(mesh, &findings));
     }
     clean.positions.par_iter_mut().for_each(|p| *p /= params.voxel_size);
-    reserve(&clean, bounds, params, run)?;
+    reserve(&clean, params, run)?;
     run.check(OPERATION)?;
 
     let corners = |t: usize| clean.corners(t);
@@ -292,15 +292,15 @@ fn check_range((lo, hi): (DVec3, DVec3), params: &MeshToLevelSet) -> Result<()> 
     Ok(())
 }
 
-/// Checks the memory limit before anything is allocated that grows with the resolution; the mesh in voxels, its bounds in world units.
-fn reserve(mesh: &TriangleMesh, (lo, hi): (DVec3, DVec3), params: &MeshToLevelSet, run: &RunOptions) -> Result<()> {
+/// Checks the memory limit before anything is allocated that grows with the resolution. The mesh in voxels.
+fn reserve(mesh: &TriangleMesh, params: &MeshToLevelSet, run: &RunOptions) -> Result<()> {
+    let (lo, hi) = mesh.bounding_box().unwrap_or_default();
     let area = |t| {
         let [a, b, c] = mesh.corners(t);
         0.5 * (b - a).cross(c - a).length()
     };
     let area = sum_of_triangles(mesh.triangles.len(), area);
-    let extent = (hi - lo) / params.voxel_size;
-    let needed = estimated_bytes(area, extent, mesh.triangles.len(), f64::from(params.half_width));
+    let needed = estimated_bytes(area, hi - lo, mesh.triangles.len(), f64::from(params.half_width));
     run.reserve(OPERATION, needed, "take a larger voxel_size")
 }
 
